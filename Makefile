@@ -1,0 +1,84 @@
+# The course's commands. Each sets up .venv when it is missing, and works twice in a row.
+#
+#   make course      execute every notebook and make a site of them to browse
+#   make test        the tests, then every notebook against its stored outputs
+#   make lab         JupyterLab on the notebooks
+#   make notebooks   execute the notebooks and store their outputs in them
+#   make lock        resolve environment.lock anew from pyproject.toml
+#   make clean       remove all that make has made, .venv too
+#
+# Another Python than python3: make PYTHON=python3.11 test
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin/python
+READY := $(VENV)/ready
+PIP := $(BIN) -m pip install --quiet
+
+NOTEBOOKS := $(sort $(wildcard notebooks/*.ipynb))
+EXECUTED := $(NOTEBOOKS:%=build/pages/%)
+WHAT_NOTEBOOKS_USE := $(shell find tutorial_lib data -type f -not -name '*.pyc')
+
+# One thread: the same numbers on every machine with the same instruction set, and on a small or busy one
+# many times faster than several.
+export OMP_NUM_THREADS := 1
+export MKL_NUM_THREADS := 1
+export PIP_DISABLE_PIP_VERSION_CHECK := 1
+
+.PHONY: course test lab notebooks lock clean
+.NOTPARALLEL:
+.DELETE_ON_ERROR:
+
+# The site is built beside links to what the notebooks' own links lead to.
+course: $(READY) $(EXECUTED)
+	@rm -f $(filter-out $(EXECUTED),$(wildcard build/pages/notebooks/*))
+	@cp site/*.md build/pages && ln -sfn ../../data ../../tutorial_lib build/pages
+	@$(BIN) -m sphinx -q -W --keep-going -c site build/pages build/site
+	@echo "The course lies at $(CURDIR)/build/site/index.html: open it in a browser."
+
+test: $(READY)
+	$(BIN) -m pytest tests
+	$(if $(NOTEBOOKS),$(BIN) -m pytest --nbval-lax --nbval-current-env --nbval-cell-timeout 600 \
+		--nbval-sanitize-with tests/sanitize.cfg notebooks)
+
+lab: $(READY)
+	$(BIN) -m jupyterlab --ip=127.0.0.1 --LabApp.default_url=/lab/tree/notebooks \
+		$(if $(filter 0,$(shell id -u)),--allow-root)
+
+notebooks: $(EXECUTED)
+	cp -p $(EXECUTED) notebooks
+
+# The kernel warns at every start that it talks in plain text, unless it need not.
+QUIETLY := --log-level=ERROR --KernelManager.transport_encryption=auto
+
+# A notebook runs in its own folder. What stays of it: outputs and counts, and no trace of the machine.
+build/pages/%.ipynb: %.ipynb $(WHAT_NOTEBOOKS_USE) $(READY)
+	@mkdir -p $(@D)
+	@printf '%-50s' $<; start=$$(date +%s); \
+	$(BIN) -m nbconvert $(QUIETLY) --to notebook --execute --output-dir $(@D) $< && \
+	$(BIN) -m nbstripout --keep-output --keep-count --keep-id --extra-keys metadata.language_info $@ && \
+	echo "$$(($$(date +%s) - start)) s"
+
+# The lock's torch goes first, alone, with what it asks for: so each machine gets the build that suits it, CPU
+# or CUDA. The rest asks for nothing, as the lock is complete, and pip would refuse bullet-safety-gym's pin.
+$(READY): environment.lock pyproject.toml
+	@$(PYTHON) -c 'import sys; v = sys.version_info; v >= (3, 11) or sys.exit("The course needs Python 3.11 or \
+	newer, and $(PYTHON) is %d.%d. Try: make PYTHON=python3.11 $(MAKECMDGOALS)" % v[:2])'
+	@echo "Setting up $(VENV): some minutes, 2 GB (more where PyTorch brings CUDA)."
+	$(PYTHON) -m venv $(VENV)
+	$(PIP) --constraint environment.lock torch
+	$(PIP) --no-deps --requirement environment.lock
+	$(PIP) --no-deps --no-build-isolation --editable .
+	@touch $@
+
+# Keeps the releases that are in the lock where they still fit; remove the file first to take the newest of all.
+# The overrides, and why bullet-safety-gym needs one, are in pyproject.toml.
+lock:
+	$(PYTHON) -m venv build/uv
+	build/uv/bin/python -m pip install --quiet uv
+	build/uv/bin/uv pip compile pyproject.toml --output-file environment.lock --quiet \
+		--no-annotate --custom-compile-command "make lock"
+
+clean:
+	rm -rf build $(VENV) *.egg-info .pytest_cache .ruff_cache
+	find . -name __pycache__ -prune -exec rm -rf {} +
