@@ -31,7 +31,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 # The site is built beside links to what the notebooks' own links lead to.
 course: $(READY) $(EXECUTED)
-	@rm -f $(filter-out $(EXECUTED),$(wildcard build/pages/notebooks/*))
+	@rm -rf build/site $(filter-out $(EXECUTED),$(wildcard build/pages/notebooks/*))
 	@cp site/*.md build/pages && ln -sfn ../../data ../../tutorial_lib build/pages
 	@$(BIN) -m sphinx -q -W --keep-going -c site build/pages build/site
 	@echo "The course lies at $(CURDIR)/build/site/index.html: open it in a browser."
