@@ -9,6 +9,7 @@ import hashlib
 import os
 import shutil
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -119,10 +120,16 @@ class Dataset:
         return Batch(**{key: torch.tensor(getattr(self, key), **options) for key in KEYS})
 
 
-def sample_batch(data: Batch, batch_size: int, generator: torch.Generator) -> Batch:
-    """`batch_size` transitions of `data`, uniform, with replacement; the generator is on its device."""
-    rows = torch.randint(len(data.rewards), (batch_size,), generator=generator, device=data.rewards.device)
-    return Batch(*(values.index_select(0, rows) for values in data))
+def sample_batch(data: Batch, batch_size: int, generators: Sequence[torch.Generator]) -> Batch:
+    """A batch for each of S runs, (S, batch_size, ...): rows of `data`, uniform, with replacement.
+
+    Every run draws from its own CPU generator, so its batches depend neither on the runs beside it nor
+    on the device of the data.
+    """
+    count = len(data.rewards)
+    rows = torch.stack([torch.randint(count, (batch_size,), generator=generator) for generator in generators])
+    flat = rows.flatten().to(data.rewards.device)
+    return Batch(*(values.index_select(0, flat).unflatten(0, rows.shape) for values in data))
 
 
 # --- Files ---

@@ -1,0 +1,1 @@
+"""A teaching library for safe offline reinforcement learning: C2IQL, its parts and its baselines."""

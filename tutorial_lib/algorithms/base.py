@@ -1,0 +1,188 @@
+"""What every algorithm shares: networks for several seeds, one optimiser step, acting, saving.
+
+An algorithm is written for one run. `Agent` holds the parameters of S seeds, stacked along a leading
+axis, and lifts the algorithm's `losses` over that axis with torch.func, so several seeds train
+together and the code that is taught is the code that runs.
+"""
+
+import copy
+from collections.abc import Callable, Sequence
+from types import SimpleNamespace
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.func import functional_call, stack_module_state, vmap
+
+from tutorial_lib.conditioning import check_threshold
+from tutorial_lib.config import Config
+from tutorial_lib.datasets import Batch, Dataset
+from tutorial_lib.tasks import Task
+
+
+class Agent:
+    """S runs of one algorithm on one task.
+
+    A subclass names its networks in `build`, its target networks in `targets`, and writes `losses`.
+    `threshold` is the fixed cost limit of algorithms that are trained for one; the conditioned ones
+    (`conditioned = True`) take a limit when they act. Raises ValueError where the two do not fit.
+    """
+
+    name: str
+    conditioned = False  # does the policy take the limit as an input?
+    constrained = True  # does training know a limit at all?
+    targets: tuple[str, ...] = ()  # networks with a Polyak-averaged copy
+
+    def __init__(
+        self, task: Task, config: Config, seeds: Sequence[int] = (0,), threshold: float | None = None, device="cpu"
+    ):
+        needs_threshold = self.constrained and not self.conditioned
+        if needs_threshold != (threshold is not None):
+            verb = "is trained for one threshold: give it one" if needs_threshold else "takes no threshold to train"
+            raise ValueError(f"{self.name} {verb}")
+        self.task, self.config, self.seeds, self.device = task, config, tuple(seeds), torch.device(device)
+        self.threshold = None if threshold is None else check_threshold(threshold)
+        self.gammas = torch.tensor(task.gammas, device=self.device)
+
+        runs = [self._build_seeded(seed) for seed in self.seeds]
+        self.modules = {name: copy.deepcopy(net).to("meta") for name, net in runs[0].items()}
+        self.parameters = {name: stack_module_state([run[name] for run in runs])[0] for name in self.modules}
+        self.parameters = _map(self.parameters, lambda p: p.detach().to(self.device).requires_grad_())
+        self.target_parameters = _map({n: self.parameters[n] for n in self.targets}, lambda p: p.detach().clone())
+        self.optimiser = torch.optim.Adam(
+            [
+                {"params": list(params.values()), "lr": self.learning_rate(name), "base_lr": self.learning_rate(name)}
+                for name, params in self.parameters.items()
+            ],
+            fused=True,
+        )
+        self.updates = 0
+
+    # What a subclass writes -------------------------------------------------------------------------
+
+    def build(self) -> dict[str, nn.Module]:
+        """The networks of one run, by name."""
+        raise NotImplementedError
+
+    def losses(self, net: SimpleNamespace, batch: Batch, limit: Tensor) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        """One run's losses and other scalars on a batch of B transitions.
+
+        `net` holds the networks by name, and the target networks as `target_<name>`; `limit` is the
+        cost limit of each transition (B,). Every loss must reach only the network that it trains.
+        """
+        raise NotImplementedError
+
+    def prepare(self, dataset: Dataset, progress: bool = True) -> None:
+        """Whatever must be learned or filtered before the first update."""
+
+    def draw_limits(self, generator: torch.Generator, batch_size: int) -> Tensor:
+        """The cost limits of one run's batch, (B,)."""
+        return torch.full((batch_size,), torch.inf if self.threshold is None else self.threshold)
+
+    def learning_rate(self, name: str) -> float:
+        """The learning rate of the network called `name` (Table 4)."""
+        if name == "policy":
+            return self.config.policy_lr
+        return self.config.critic_lr if "critic" in name else self.config.value_lr
+
+    def policy_input(self, observations: Tensor, limit: Tensor) -> Tensor:
+        """What the policy sees: the observation, for conditioned agents with the encoded limit."""
+        return observations
+
+    # What they all share ----------------------------------------------------------------------------
+
+    def update(self, batch: Batch, generators: Sequence[torch.Generator]) -> dict[str, Tensor]:
+        """One gradient step of every run; batch fields are (S, B, ...). Returns named scalars, each (S,).
+
+        All losses look at the same, old parameters, then all networks step at once: the policy and
+        the targets of Q see V from before this step. (IQL's code updates V first; at these learning
+        rates the difference is one step's worth, and one joint step is faster.)
+        """
+        limits = torch.stack([self.draw_limits(g, batch.rewards.shape[1]) for g in generators]).to(self.device)
+        if len(self.seeds) == 1:  # the same function without the lift, which is not free
+            squeezed = _map(self.parameters, lambda p: p[0]), _map(self.target_parameters, lambda p: p[0])
+            loss, scalars = self._total(*squeezed, Batch(*(x[0] for x in batch)), limits[0])
+            scalars = {name: value[None] for name, value in scalars.items()}
+        else:
+            loss, scalars = vmap(self._total)(self.parameters, self.target_parameters, batch, limits)
+        self.optimiser.zero_grad()
+        loss.sum().backward()  # runs share no parameter, so each gets its own gradient
+        for group in self.optimiser.param_groups:
+            group["lr"] = group["base_lr"]
+        self.optimiser.param_groups[list(self.parameters).index("policy")]["lr"] *= self._cosine()
+        self.optimiser.step()
+        for name, averages in self.target_parameters.items():
+            torch._foreach_lerp_(list(averages.values()), list(self.parameters[name].values()), self.config.target_tau)
+        self.updates += 1
+        return scalars
+
+    def act(self, observations, limit, run: int = 0) -> np.ndarray:
+        """Mean actions (E, act) of run number `run` at observations (E, obs) under cost limits (E,)."""
+        with torch.no_grad():
+            x = self._tensor(observations), self._tensor(limit)
+            mean, _ = self.network("policy", run)(self.policy_input(*x))
+            return mean.cpu().numpy()
+
+    def predicted_cost(self, observations, limit, run: int = 0) -> np.ndarray:
+        """Whole-episode cost that the critics expect of the policy's action, (E,); NaN where there are none."""
+        return np.full(len(observations), np.nan)
+
+    def network(self, name: str, run: int = 0) -> Callable[..., Tensor]:
+        """One network of one run, to be called."""
+        return _bind(self.modules[name], {key: value[run].detach() for key, value in self.parameters[name].items()})
+
+    def state(self) -> dict[str, Tensor]:
+        """Every tensor that a resumed run needs, by a flat name."""
+        tensors = {f"online.{n}.{k}": v.detach() for n, p in self.parameters.items() for k, v in p.items()}
+        tensors |= {f"target.{n}.{k}": v for n, p in self.target_parameters.items() for k, v in p.items()}
+        for index, moments in self.optimiser.state_dict()["state"].items():
+            tensors |= {f"adam.{index}.{key}": value for key, value in moments.items()}
+        return tensors | {"updates": torch.tensor(self.updates)}
+
+    def load_state(self, tensors: dict[str, Tensor]) -> None:
+        """The inverse of `state`; optimiser moments may be absent. Raises KeyError for a missing tensor."""
+        with torch.no_grad():
+            for kind, parameters in (("online", self.parameters), ("target", self.target_parameters)):
+                for name, params in parameters.items():
+                    for key, value in params.items():
+                        value.copy_(tensors[f"{kind}.{name}.{key}"])
+        state = self.optimiser.state_dict()
+        state["state"] = {}
+        for key, value in tensors.items():
+            if key.startswith("adam."):
+                _, index, moment = key.split(".")
+                state["state"].setdefault(int(index), {})[moment] = value
+        self.optimiser.load_state_dict(state)
+        self.updates = int(tensors["updates"])
+
+    def __getstate__(self):
+        """What a worker process needs to act: not the optimiser."""
+        return {key: value for key, value in vars(self).items() if key != "optimiser"}
+
+    def _build_seeded(self, seed: int) -> dict[str, nn.Module]:
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            return self.build()
+
+    def _total(self, parameters, target_parameters, batch: Batch, limit: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        """One run's losses, summed, and its scalars, as a function of its parameters."""
+        online = {name: _bind(self.modules[name], p) for name, p in parameters.items()}
+        target = {f"target_{name}": _bind(self.modules[name], p) for name, p in target_parameters.items()}
+        losses, scalars = self.losses(SimpleNamespace(**online, **target), batch, limit)
+        scalars = {f"{name}_loss": loss for name, loss in losses.items()} | scalars
+        return sum(losses.values()), {name: value.detach() for name, value in scalars.items()}
+
+    def _cosine(self) -> float:
+        return 0.5 * (1 + np.cos(np.pi * min(self.updates / self.config.steps, 1)))
+
+    def _tensor(self, x) -> Tensor:
+        return torch.as_tensor(np.asarray(x, np.float32), device=self.device)
+
+
+def _bind(module: nn.Module, parameters: dict[str, Tensor]) -> Callable[..., Tensor]:
+    """The module as a function of its inputs alone, with these parameters for its own."""
+    return lambda *inputs: functional_call(module, parameters, inputs)
+
+
+def _map(parameters, function):
+    return {name: {key: function(value) for key, value in params.items()} for name, params in parameters.items()}

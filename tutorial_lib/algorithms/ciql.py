@@ -1,0 +1,55 @@
+"""Constrained implicit Q-learning (Section 3.1): IQL with a penalty, and costs under the same implicit policy."""
+
+from tutorial_lib import losses as L
+from tutorial_lib.algorithms.base import Agent
+from tutorial_lib.discounting import average_threshold
+from tutorial_lib.networks import Critics, Policy, Value, gaussian_log_prob
+
+
+class CIQL(Agent):
+    """Equations 11 to 18 for one threshold L: costs are discounted once and compared with L~ (eq. 2)."""
+
+    name = "CIQL"
+    targets = ("critics", "cost_critics")
+
+    def build(self):
+        task, config = self.task, self.config
+        scale = task.max_return / task.horizon / (1 - config.gamma)
+        cost_scale = (0.3 / (1 - config.gamma),)  # one head; 0.3: an unsafe step in three
+        return {
+            "value": Value(task.obs_dim, config, scale),
+            "cost_value": Value(task.obs_dim, config, cost_scale),
+            "critics": Critics(task.obs_dim, task.act_dim, config, scale),
+            "cost_critics": Critics(task.obs_dim, task.act_dim, config, cost_scale, k=config.cost_critics),
+            "policy": Policy(task.obs_dim, task.act_dim, config),
+        }
+
+    def losses(self, net, batch, limit):
+        config, s, a, s_next = self.config, batch.observations, batch.actions, batch.next_observations
+        mask = 1 - batch.terminals  # bootstrap through time limits, stop where the robot fell
+        average_limit = average_threshold(limit, config.gamma, self.task.horizon)
+
+        q_cost = net.target_cost_critics(s, a).amax(0)  # (B, 1)
+        q = L.penalised_q(net.target_critics(s, a).amin(0), q_cost[:, 0], average_limit)  # eq. 11
+        v = net.value(s)
+        value_loss = L.expectile_loss(q, v, config.kappa_1)  # eq. 12
+
+        weight = L.expectile_weight(q - v, config.kappa_1)  # Theorem 1
+        cost_value_loss = L.cost_value_loss(weight, q_cost, net.cost_value(s))  # eq. 17
+
+        target = L.td_target(batch.rewards, config.gamma, net.value(s_next), mask)
+        critic_loss = L.td_loss(target, net.critics(s, a))
+
+        cost_target = L.td_target(batch.costs[:, None], config.gamma, net.cost_value(s_next), mask[:, None])  # eq. 16
+        cost_critic_loss = L.td_loss(cost_target, net.cost_critics(s, a))
+
+        weight = L.expectile_weight(q - v, config.kappa_2)
+        policy_loss = L.policy_loss(weight, gaussian_log_prob(a, *net.policy(s)))  # eq. 18
+        losses = {
+            "value": value_loss,
+            "cost_value": cost_value_loss,
+            "critic": critic_loss,
+            "cost_critic": cost_critic_loss,
+            "policy": policy_loss,
+        }
+        return losses, {"safe_fraction": (q_cost[:, 0] <= average_limit).float().mean(), "value_mean": v.mean()}

@@ -1,0 +1,224 @@
+"""From behaviour policies to a dataset: `c2iql collect TASK`.
+
+One PPO agent (stable-baselines3, the maintained reference implementation) learns a whole family of
+behaviours at once. Every episode draws a price for an unsafe step and a free allowance of them, the
+policy sees both, and its reward is r - price * cost once the allowance is used up. Prices alone give
+steady trade-offs between reward and cost (a Lagrangian with a fixed multiplier); allowances reach the
+costs in between where the best policy is all or nothing, as in the Run tasks. Every training episode
+is kept, as DSRL does, so that the data holds beginners and experts; a grid over cost and return then
+thins it. Neither price nor allowance is stored: the data looks like logs of many unknown policies.
+"""
+
+import os
+import time
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
+from pathlib import Path
+
+import gymnasium
+import joblib
+import numpy as np
+import torch
+from safetensors.numpy import load_file, save_file
+from tqdm.auto import tqdm
+
+from tutorial_lib.datasets import Dataset, write_dataset
+from tutorial_lib.envs import make_env
+from tutorial_lib.tasks import Task, get_task
+
+FIELDS = ("observations", "next_observations", "actions", "rewards", "costs", "terminals", "timeouts")
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How one task's data is collected."""
+
+    steps: int = 2_000_000
+    """Simulator steps of one PPO run."""
+    prices: tuple[float, float] = (0.02, 4.0)
+    """Range of the price of an unsafe step, in units of the task's best mean reward per step."""
+    allowance_share: float = 0.5
+    """Share of episodes with a free allowance, uniform over the cost range; the others have none."""
+    learning_rate: tuple[float, float] = (1e-3, 3e-4)
+    """PPO's learning rate at the first and at the last step."""
+    batch_steps: int = 4096
+    """Steps between two PPO updates, over 16 environments."""
+    free_share: float = 0.15
+    """Share of the run in which unsafe steps are free: a robot that cannot move yet would learn to stand still."""
+    ramp_share: float = 0.35
+    """Share of the run, after that, over which prices rise to their full size."""
+
+
+RECIPES = {name: Recipe() for name in ("BallRun", "BallCircle", "CarRun", "CarCircle")}
+
+
+class PricedCost(gymnasium.Wrapper):
+    """Appends (price, allowance left) to the observation, charges for unsafe steps, records the episode."""
+
+    def __init__(self, task: Task, recipe: Recipe, rng: np.random.Generator, episodes: list[dict]):
+        super().__init__(make_env(task))
+        self.task, self.recipe, self.rng, self.episodes = task, recipe, rng, episodes
+        self.price_scale = 0.0
+        limit = np.append(self.env.observation_space.high, [1000.0, 1000.0]).astype(np.float32)
+        self.observation_space = gymnasium.spaces.Box(-limit, limit)
+
+    def reset(self, *, seed=None, options=None):
+        low, high = np.log(self.recipe.prices)
+        if self.rng.random() < self.recipe.allowance_share:
+            self.log_price, self.allowance = high, self.rng.uniform(0, self.task.cost_range)
+        else:
+            self.log_price, self.allowance = self.rng.uniform(low, high), 0.0
+        self.observation, info = self.env.reset(seed=int(self.rng.integers(2**31)))
+        self.record = {name: [] for name in FIELDS}
+        return self._augmented(), info
+
+    def step(self, action):
+        last = self.observation
+        self.observation, reward, terminated, truncated, info = self.env.step(action)
+        row = (last, self.observation, action, reward, info["cost"], terminated, truncated)
+        for name, value in zip(FIELDS, row, strict=True):
+            self.record[name].append(value)
+        self.allowance -= info["cost"]
+        charged = info["cost"] * (self.allowance < 0) * self.price_scale
+        if terminated or truncated:
+            self.episodes.append({name: np.asarray(values) for name, values in self.record.items()})
+        reward = reward * self.task.horizon / self.task.max_return - np.exp(self.log_price) * charged
+        return self._augmented(), float(reward), terminated, truncated, info
+
+    def _augmented(self):
+        left = max(self.allowance, 0.0) / self.task.cost_range
+        return np.append(self.observation, [self.log_price, 2 * left]).astype(np.float32)
+
+
+def run_ppo(task: Task, recipe: Recipe, seed: int, folder: Path, slice_steps: int = 100_000) -> None:
+    """One PPO run; after every slice its episodes and its state are on disk, and a killed run goes on from there."""
+    torch.set_num_threads(1)
+    folder.mkdir(parents=True, exist_ok=True)
+    done = len(list(folder.glob("episodes-*.safetensors")))
+    slices = -(-recipe.steps // slice_steps)
+    if done == slices:
+        return
+    episodes: list[dict] = []
+    clock = {"progress": 0.0}
+    model = _make_ppo(task, recipe, seed + 1000 * done, episodes, clock)
+    if done:
+        _load_ppo(model, folder / "state.safetensors")
+    bar = tqdm(total=slices * slice_steps, initial=done * slice_steps, desc=f"{task.name} seed {seed}", unit="step")
+    for index in range(done, slices):
+        started = time.perf_counter()
+        goal = (index + 1) * slice_steps
+        clock["progress"] = index / slices
+        ramp = (clock["progress"] - recipe.free_share) / recipe.ramp_share
+        model.env.set_attr("price_scale", float(np.clip(ramp, 0, 1)))
+        model.learn(goal - model.num_timesteps, reset_num_timesteps=False)
+        arrays = {name: np.concatenate([e[name] for e in episodes]) for name in FIELDS}
+        episodes.clear()
+        _save_ppo(model, folder / "state.safetensors", time.perf_counter() - started)
+        _save(arrays, folder / f"episodes-{index:03d}.safetensors")
+        bar.update(slice_steps)
+    bar.close()
+
+
+def collect(
+    task: Task | str, seeds: tuple[int, ...], recipe: Recipe, folder: Path, out: Path, episodes: int, workers: int = 2
+) -> Dataset:
+    """Run PPO for every seed (side by side, resumable), thin the episodes, and write the dataset to `out`."""
+    task = get_task(task) if isinstance(task, str) else task
+    runs = [folder / task.name / f"seed-{seed}" for seed in seeds]
+    joblib.Parallel(n_jobs=workers)(
+        joblib.delayed(run_ppo)(task, recipe, seed, run) for seed, run in zip(seeds, runs, strict=True)
+    )
+    parts = [load_file(file) for run in runs for file in sorted(run.glob("episodes-*.safetensors"))]
+    everything = Dataset(**{name: np.concatenate([part[name] for part in parts]) for name in FIELDS})
+    chosen = thin(everything.episode_costs, everything.episode_returns, episodes, task.cost_range)
+    seconds = sum(float(load_file(run / "state.safetensors")["seconds"][0]) for run in runs)
+    dataset = everything.select(chosen)
+    write_dataset(
+        out,
+        dataset,
+        task,
+        attributes={
+            "task": task.name,
+            "made_by": f"c2iql collect {task.name}",
+            "seeds": str(list(seeds)),
+            "recipe": str(asdict(recipe)),
+            "collected_episodes": everything.num_episodes,
+            "wall_seconds": round(seconds),
+            "versions": ", ".join(f"{p} {version(p)}" for p in ("stable-baselines3", "pybullet", "bullet-safety-gym", "torch")),
+            "licence": "CC BY 4.0",
+        },
+    )
+    return dataset
+
+
+def thin(costs: np.ndarray, returns: np.ndarray, n: int, max_cost: float, cells: int = 20, seed: int = 0) -> np.ndarray:
+    """Indices of about n episodes of cost <= max_cost, spread evenly over a cells x cells grid of cost and return.
+
+    Every occupied cell keeps at most k episodes, with the smallest k that gives n of them; within a
+    cell the choice is random. The best returns at every cost stay, and no cost drowns the others.
+    """
+    rng = np.random.default_rng(seed)
+    within = rng.permutation(np.flatnonzero(costs <= max_cost))
+    low, high = returns[within].min(), returns[within].max()
+    column = np.minimum(costs[within] / max_cost * cells, cells - 1).astype(int)
+    row = np.minimum((returns[within] - low) / max(high - low, 1e-9) * cells, cells - 1).astype(int)
+    cell = column * cells + row
+    order = np.argsort(cell, kind="stable")
+    first = np.searchsorted(cell[order], cell[order])
+    rank = np.empty(len(cell), int)
+    rank[order] = np.arange(len(cell)) - first  # 0, 1, 2 ... within each cell
+    k = np.sort(rank)[min(n, len(rank)) - 1] + 1 if len(rank) else 0
+    return np.sort(within[rank < k])
+
+
+def _make_ppo(task: Task, recipe: Recipe, seed: int, episodes: list[dict], clock: dict[str, float]):
+    from stable_baselines3 import PPO
+    from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+    rngs = np.random.default_rng(seed).spawn(16)
+    envs = VecNormalize(DummyVecEnv([lambda rng=rng: PricedCost(task, recipe, rng, episodes) for rng in rngs]))
+    first, last = recipe.learning_rate
+
+    def learning_rate(_):  # stable-baselines3's own progress starts anew with every slice
+        return first + (last - first) * clock["progress"]
+
+    policy = {"net_arch": [64, 64], "log_std_init": -0.5}
+    return PPO(
+        "MlpPolicy", envs, learning_rate, recipe.batch_steps // 16, 512, policy_kwargs=policy, seed=seed, device="cpu"
+    )
+
+
+def _save_ppo(model, path: Path, seconds: float) -> None:
+    """PPO's weights, Adam's moments, the running normalisation and the clock; plain arrays, no pickle."""
+    arrays = {f"policy.{key}": value.numpy() for key, value in model.policy.state_dict().items()}
+    for index, moments in model.policy.optimizer.state_dict()["state"].items():
+        arrays |= {f"adam.{index}.{key}": np.asarray(value) for key, value in moments.items()}
+    for name in ("obs_rms", "ret_rms"):
+        rms = getattr(model.env, name)
+        arrays |= {f"{name}.{key}": np.asarray(getattr(rms, key)) for key in ("mean", "var", "count")}
+    before = float(load_file(path)["seconds"]) if path.exists() else 0.0
+    clock = {"steps": np.asarray(model.num_timesteps), "seconds": np.asarray(before + seconds)}
+    _save(arrays | clock, path)
+
+
+def _load_ppo(model, path: Path) -> None:
+    arrays = load_file(path)
+    tensors = {key: torch.as_tensor(value) for key, value in arrays.items()}
+    model.policy.load_state_dict({k.removeprefix("policy."): v for k, v in tensors.items() if k.startswith("policy.")})
+    state = model.policy.optimizer.state_dict()
+    for key, value in tensors.items():
+        if key.startswith("adam."):
+            _, index, moment = key.split(".")
+            state["state"].setdefault(int(index), {})[moment] = value
+    model.policy.optimizer.load_state_dict(state)
+    for name in ("obs_rms", "ret_rms"):
+        for key in ("mean", "var", "count"):
+            setattr(getattr(model.env, name), key, arrays[f"{name}.{key}"])
+    model.num_timesteps = int(arrays["steps"])
+
+
+def _save(arrays: dict[str, np.ndarray], path: Path) -> None:
+    """Write a safetensors file whole or not at all."""
+    temporary = path.with_suffix(".tmp")
+    save_file({key: np.asarray(value, order="C") for key, value in arrays.items()}, temporary)
+    os.replace(temporary, path)

@@ -1,0 +1,85 @@
+"""Hyperparameters: the paper's Table 4, the choices that it leaves open, and one small profile."""
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class Config:
+    """Everything that a training run depends on besides its task, data, algorithm and seed.
+
+    The defaults are the `paper` profile. Fields under "paper silent" are ours, each with its reason.
+    """
+
+    # Table 4
+    kappa_1: float = 0.7
+    """Expectile of both value functions, V_r and V_c."""
+    kappa_2: float = 0.9
+    """Expectile of the policy extraction: the temperature between cloning and maximising."""
+    gamma: float = 0.99
+    """Discount factor of the reward, and of the cost where there is no reconstruction."""
+    batch_size: int = 512
+    value_lr: float = 1e-3
+    """Adam's learning rate for V_r and V_c."""
+    critic_lr: float = 1e-3
+    """Adam's learning rate for Q_r and Q_c."""
+    policy_lr: float = 3e-4
+    """Adam's learning rate for the policy; decays to zero along a half cosine, as in IQL."""
+    steps: int = 400_000
+    """Gradient updates."""
+
+    # Networks: "the structure follows IQL"
+    hidden_width: int = 256
+    hidden_layers: int = 2
+    target_tau: float = 0.005
+    """Polyak step of the target critics."""
+    awr_alpha: float = 3.0
+    """Eq. 8's temperature, for IQL alone, on rewards scaled to a range of returns of 1000 (IQL's)."""
+
+    # Appendix B.2: the cost reconstruction model
+    crm: Literal["mlp", "linear"] = "mlp"
+    """'linear' is the least-squares baseline on the same data and noise."""
+    crm_width: int = 512
+    crm_layers: int = 5
+    crm_steps: int = 1_000_000
+    """Iterations of Algorithm 1 (the paper says epochs; one pass over random data has no end)."""
+    crm_noise: float = 0.1
+    """Standard deviation of the noise on the reconstruction model's inputs, in discounted cost."""
+
+    # Paper silent: we ...
+    time_limits: Literal["rate", "bootstrap", "mask"] = "rate"
+    """What a time limit means to the cost critics. 'rate' bootstraps through it and scales head i by
+    1 - gamma_i^T before the reconstruction; 'bootstrap' leaves out the factor; 'mask' stops there, so that
+    the estimate is the remaining cost and is compared with the unscaled remaining budget."""
+    cost_kappa: float | None = None
+    """Expectile whose implicit policy the cost critics evaluate; None: kappa_1, as Algorithm 2. The policy
+    that runs is extracted with kappa_2, so kappa_2 here evaluates (nearly) the policy that runs."""
+    cost_critics: int = 2
+    """Ensemble of cost critics; the largest reconstruction counts. 1: a single critic."""
+    thresholds_per: Literal["sample", "batch"] = "sample"
+    """One threshold per transition (lower variance), or one per batch as Algorithm 2's line 5 reads."""
+    infinite_at_test: bool = False
+    """May the budget rule pick the infinite threshold? 'The closest value' never is infinite."""
+    shift_rewards: bool = False
+    """Train on rewards minus their dataset minimum. The zero penalty punishes only where Q_r > 0."""
+
+
+PROFILES: dict[str, Config] = {"paper": Config()}
+PROFILES["small"] = dataclasses.replace(
+    PROFILES["paper"],
+    batch_size=256,
+    hidden_width=128,
+    crm_width=64,
+    crm_layers=2,
+    crm_steps=5_000,
+    steps=20_000,
+    target_tau=0.02,
+)
+
+
+def get_profile(name: str) -> Config:
+    """The profile called `name`, or ValueError that lists those there are."""
+    if name not in PROFILES:
+        raise ValueError(f"unknown profile {name!r}: the profiles are {', '.join(PROFILES)}")
+    return PROFILES[name]

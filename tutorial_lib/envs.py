@@ -1,0 +1,113 @@
+"""Bullet tasks behind gymnasium's API: truly seeded, with the cost in a field of its own.
+
+The simulator, `bullet-safety-gym`, ignores `reset(seed=...)`: it draws from NumPy's global generator
+and lets the motor commands of one episode act on the first instant of the next. Both are mended
+here, so a seed names an episode whatever ran before it.
+"""
+
+import contextlib
+import sys
+import warnings
+
+import gymnasium
+import numpy as np
+
+from tutorial_lib.tasks import Task, get_task
+
+
+class BulletTask(gymnasium.Env):
+    """One task of Bullet-Safety-Gym.
+
+    Observations are float32 (obs_dim,), actions float32 (act_dim,) in [-1, 1]. `step` returns the
+    reward and puts the cost, 0.0 or 1.0, into `info["cost"]`. `terminated` means that the robot fell
+    or tipped over; `truncated` that the horizon was reached: the two are never merged.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 15}
+
+    def __init__(self, task: Task | str, render_mode: str | None = None, image_size=(320, 240)):
+        if render_mode not in (None, "rgb_array"):
+            raise ValueError(f"render_mode must be None or 'rgb_array', not {render_mode!r}")
+        self.task = get_task(task) if isinstance(task, str) else task
+        self.render_mode = render_mode
+        self.image_size = image_size
+        self._sim = _make_simulator(self.task.env_id)
+        limit = np.full(self.task.obs_dim, 1000.0, np.float32)
+        self.observation_space = gymnasium.spaces.Box(-limit, limit, dtype=np.float32)
+        one = np.ones(self.task.act_dim, np.float32)
+        self.action_space = gymnasium.spaces.Box(-one, one, dtype=np.float32)
+        self._steps = 0
+        self._sim.reset()  # the simulator saves its state at its first reset and restores it at the others
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self._motors_off()
+        with _global_numpy_seed(int(self.np_random.integers(2**32))):
+            observation, _ = self._sim.reset()
+        self._steps = 0
+        return observation.astype(np.float32), {"cost": 0.0}
+
+    def step(self, action):
+        action = np.asarray(action, np.float32)
+        if action.shape != (self.task.act_dim,):
+            raise ValueError(f"{self.task.name} takes actions of shape ({self.task.act_dim},), not {action.shape}")
+        observation, reward, terminated, _, info = self._sim.step(action)
+        self._steps += 1
+        truncated = self._steps >= self.task.horizon and not terminated
+        return observation.astype(np.float32), float(reward), terminated, truncated, {"cost": float(info["cost"])}
+
+    def render(self):
+        """The scene as (height, width, 3) uint8, drawn off-screen; None without `render_mode`."""
+        if self.render_mode is None:
+            return None
+        client, camera = self._sim.bc, self._sim.world.camera
+        width, height = self.image_size
+        view = client.computeViewMatrixFromYawPitchRoll(
+            camera.cam_base_pos, camera.cam_dist, camera.cam_yaw, camera.cam_pitch, 0, 2
+        )
+        projection = client.computeProjectionMatrixFOV(fov=60, aspect=width / height, nearVal=0.1, farVal=100.0)
+        pixels = client.getCameraImage(width, height, view, projection, renderer=client.ER_TINY_RENDERER)[2]
+        return np.asarray(pixels, np.uint8).reshape(height, width, 4)[..., :3]
+
+    def close(self):
+        self._sim.close()
+
+    @property
+    def position(self) -> np.ndarray:
+        """The robot's (x, y) in metres: what the Run and Circle costs look at."""
+        return self._sim.agent.get_position()[:2]
+
+    def _motors_off(self):
+        """Forget the last episode's motor commands: the simulator's reset steps the physics once."""
+        client, body = self._sim.bc, self._sim.agent.body_id
+        for joint in range(client.getNumJoints(body)):
+            client.setJointMotorControl2(body, joint, client.VELOCITY_CONTROL, targetVelocity=0, force=0)
+
+
+def make_env(task: Task | str, **options) -> BulletTask:
+    """The environment of a task, by its record or its name. Raises ValueError for an unknown name."""
+    return BulletTask(task, **options)
+
+
+def _make_simulator(env_id: str):
+    """The bare simulator, without gymnasium's wrappers.
+
+    It silences its own start-up by file descriptor, which a notebook's stdout may not have.
+    """
+    real_streams = (contextlib.redirect_stdout(sys.__stdout__), contextlib.redirect_stderr(sys.__stderr__))
+    with warnings.catch_warnings(), real_streams[0], real_streams[1]:
+        warnings.simplefilter("ignore")
+        import bullet_safety_gym  # noqa: F401  (registers the environments)
+
+        return gymnasium.make(env_id, disable_env_checker=True).unwrapped
+
+
+@contextlib.contextmanager
+def _global_numpy_seed(seed: int):
+    """The one place where global random state is touched, because the simulator draws from it."""
+    state = np.random.get_state()
+    np.random.seed(seed)
+    try:
+        yield
+    finally:
+        np.random.set_state(state)

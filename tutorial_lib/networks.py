@@ -1,0 +1,93 @@
+"""Networks for one run; every one takes a leading batch axis B and returns values (B,) or heads (B, m)."""
+
+import math
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from tutorial_lib.config import Config
+
+
+def mlp(inputs: int, width: int, layers: int, outputs: int) -> nn.Sequential:
+    """`layers` hidden layers of `width` ReLU units, and a linear output."""
+    sizes = [inputs] + [width] * layers
+    hidden = [m for i, o in zip(sizes, sizes[1:], strict=False) for m in (nn.Linear(i, o), nn.ReLU())]
+    return nn.Sequential(*hidden, nn.Linear(sizes[-1], outputs))
+
+
+def _heads(scale: float | tuple[float, ...]) -> int:
+    return len(scale) if isinstance(scale, tuple) else 1
+
+
+def _scaled(output: Tensor, scale: float | tuple[float, ...]) -> Tensor:
+    """(..., m) times its m scales, or (..., 1) times its one scale and squeezed to (...,)."""
+    if isinstance(scale, tuple):
+        return output * torch.tensor(scale, device=output.device)
+    return output.squeeze(-1) * scale
+
+
+class Value(nn.Module):
+    """V(s): observations (B, obs) to (B,), or with m scales to m heads (B, m) (eq. 22).
+
+    The output is multiplied by `scale`, the size that values are expected to have: the network then
+    learns numbers of order one, and heads of different discount learn at the same pace.
+    """
+
+    def __init__(self, obs_dim: int, config: Config, scale: float | tuple[float, ...]):
+        super().__init__()
+        self.scale = scale
+        self.net = mlp(obs_dim, config.hidden_width, config.hidden_layers, _heads(scale))
+
+    def forward(self, observations: Tensor) -> Tensor:
+        return _scaled(self.net(observations), self.scale)
+
+
+class EnsembleLinear(nn.Module):
+    """k linear layers as one batched product: (k, B, in) to (k, B, out), initialised like nn.Linear."""
+
+    def __init__(self, k: int, inputs: int, outputs: int):
+        super().__init__()
+        bound = 1 / math.sqrt(inputs)
+        self.weight = nn.Parameter(torch.empty(k, inputs, outputs).uniform_(-bound, bound))
+        self.bias = nn.Parameter(torch.empty(k, 1, outputs).uniform_(-bound, bound))
+
+    def forward(self, x: Tensor) -> Tensor:
+        return torch.baddbmm(self.bias, x, self.weight)
+
+
+class Critics(nn.Module):
+    """k independent Q(s, a): (B, obs) and (B, act) to (k, B), or with m scales to m heads (k, B, m) (eq. 22)."""
+
+    def __init__(self, obs_dim: int, act_dim: int, config: Config, scale: float | tuple[float, ...], k: int = 2):
+        super().__init__()
+        self.k, self.scale = k, scale
+        sizes = [obs_dim + act_dim] + [config.hidden_width] * config.hidden_layers + [_heads(scale)]
+        self.layers = nn.ModuleList(EnsembleLinear(k, i, o) for i, o in zip(sizes, sizes[1:], strict=False))
+
+    def forward(self, observations: Tensor, actions: Tensor) -> Tensor:
+        x = torch.cat([observations, actions], -1).expand(self.k, -1, -1)
+        for layer in self.layers[:-1]:
+            x = F.relu(layer(x))
+        return _scaled(self.layers[-1](x), self.scale)
+
+
+class Policy(nn.Module):
+    """pi(a | s): a Gaussian with a tanh mean (B, act) and a log-std that no state changes, as in IQL."""
+
+    LOG_STD = (-5.0, 2.0)
+
+    def __init__(self, obs_dim: int, act_dim: int, config: Config):
+        super().__init__()
+        self.net = mlp(obs_dim, config.hidden_width, config.hidden_layers, act_dim)
+        self.log_std = nn.Parameter(torch.zeros(act_dim))
+
+    def forward(self, observations: Tensor) -> tuple[Tensor, Tensor]:
+        """The mean action (B, act), which is what runs in the simulator, and the log-std (act,)."""
+        return torch.tanh(self.net(observations)), self.log_std.clamp(*self.LOG_STD)
+
+
+def gaussian_log_prob(actions: Tensor, mean: Tensor, log_std: Tensor) -> Tensor:
+    """log N(actions; mean, exp(log_std)), (B,), summed over the dimensions of the action; not squashed."""
+    z = (actions - mean) * torch.exp(-log_std)
+    return (-0.5 * z.square() - log_std - 0.5 * math.log(2 * math.pi)).sum(-1)

@@ -1,0 +1,175 @@
+"""The training loop: sample, update, log, checkpoint, resume. It knows algorithms only by their interface."""
+
+import csv
+import json
+import os
+import time
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from tqdm.auto import tqdm
+
+from tutorial_lib.algorithms import Agent, get_algorithm
+from tutorial_lib.config import Config
+from tutorial_lib.datasets import Batch, Dataset, sample_batch
+from tutorial_lib.tasks import get_task
+
+CHECKPOINT = "checkpoint.safetensors"
+METRICS = "metrics.csv"
+
+
+class TrainingError(RuntimeError):
+    """Training cannot go on: what happened, when, and what to try."""
+
+
+def train(
+    agent: Agent,
+    dataset: Dataset,
+    steps: int | None = None,
+    run_dir: Path | None = None,
+    log_every: int = 250,
+    checkpoint_every: int = 2_500,
+    on_checkpoint: Callable[[Agent], None] | None = None,
+    progress: bool = True,
+) -> list[dict]:
+    """Train all runs of `agent` until it has made `steps` updates (default: its config's). Returns the log.
+
+    With a `run_dir`, scalars go to metrics.csv and everything needed to go on to checkpoint.safetensors,
+    every `checkpoint_every` updates; called again on the same folder, it continues from there, bit for bit
+    on the same machine. Each run samples with a generator of its own, seeded by its seed, so its batches
+    do not depend on which seeds train beside it. Raises TrainingError when a loss is NaN or infinite.
+    """
+    steps = agent.config.steps if steps is None else steps
+    generators = [torch.Generator().manual_seed(seed) for seed in agent.seeds]
+    log = _resume(agent, generators, run_dir) if run_dir and (run_dir / CHECKPOINT).exists() else []
+    if not agent.updates:
+        agent.prepare(dataset, progress)
+    data = _training_data(dataset, agent)
+    bar = tqdm(total=steps, initial=agent.updates, desc=agent.name, unit="update", disable=not progress, mininterval=0.5)
+    started, first = time.perf_counter(), agent.updates
+    while agent.updates < steps:
+        batch = sample_batch(data, agent.config.batch_size, generators)
+        scalars = agent.update(batch, generators)
+        bar.update()
+        last = agent.updates == steps
+        if last or agent.updates % log_every == 0:
+            rows = _rows(agent, scalars, (agent.updates - first) / (time.perf_counter() - started))
+            _check_finite(rows)
+            log += rows
+            bar.set_postfix(_summary(scalars))
+        if run_dir and (last or agent.updates % checkpoint_every == 0):
+            save_checkpoint(agent, generators, log, run_dir)
+            if on_checkpoint:
+                on_checkpoint(agent)
+    bar.close()
+    return log
+
+
+def _training_data(dataset: Dataset, agent: Agent) -> Batch:
+    data = dataset.tensors(agent.device)
+    # A Gaussian policy with a tanh mean cannot reach an action of exactly one: IQL clips a hair inside.
+    data = data._replace(actions=data.actions.clamp(-1 + 1e-5, 1 - 1e-5))
+    if agent.config.shift_rewards:
+        data = data._replace(rewards=data.rewards - data.rewards.min())
+    return data
+
+
+def _rows(agent: Agent, scalars: dict[str, torch.Tensor], speed: float) -> list[dict]:
+    """One row per run: which, when, how fast, and every scalar."""
+    values = {name: value.tolist() for name, value in scalars.items()}
+    return [
+        {"seed": seed, "update": agent.updates, "updates_per_second": round(speed, 2)}
+        | {name: value[run] for name, value in values.items()}
+        for run, seed in enumerate(agent.seeds)
+    ]
+
+
+def _check_finite(rows: list[dict]) -> None:
+    for row in rows:
+        for name, value in row.items():
+            if value - value != 0:  # NaN and both infinities
+                raise TrainingError(
+                    f"{name} is {value} at update {row['update']} of seed {row['seed']}: the last checkpoint is kept; "
+                    "try a smaller learning rate, and look at the data for outliers"
+                )
+
+
+def _summary(scalars: dict[str, torch.Tensor]) -> dict[str, str]:
+    """What the progress bar shows: the losses and the safe fraction, averaged over the runs."""
+    shown = {name: value for name, value in scalars.items() if name.endswith("_loss") or name == "safe_fraction"}
+    return {name.removesuffix("_loss"): f"{value.mean():.3g}" for name, value in shown.items()}
+
+
+# --- Files ---
+
+
+def save_agent(agent: Agent, path: Path, **extra: torch.Tensor) -> None:
+    """All tensors of an agent, with what is needed to build it again in the file's header. Atomic."""
+    header = {
+        "task": agent.task.name,
+        "algorithm": agent.name,
+        "config": json.dumps(asdict(agent.config)),
+        "seeds": json.dumps(agent.seeds),
+        "threshold": json.dumps(agent.threshold),
+    }
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_suffix(".tmp")
+    tensors = {key: value.detach().cpu().contiguous() for key, value in (agent.state() | extra).items()}
+    save_file(tensors, temporary, metadata=header)
+    os.replace(temporary, path)
+
+
+def load_agent(path: Path | str, device="cpu") -> Agent:
+    """The agent that `save_agent` wrote. Raises TrainingError for a file that is not one, or is damaged."""
+    path = Path(path)
+    try:
+        with safe_open(path, "pt") as file:
+            header = file.metadata() or {}
+            tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118  (not a mapping)
+        agent = get_algorithm(header["algorithm"])(
+            get_task(header["task"]),
+            Config(**json.loads(header["config"])),
+            seeds=json.loads(header["seeds"]),
+            threshold=json.loads(header["threshold"]),
+            device=device,
+        )
+        agent.load_state(tensors)
+    except FileNotFoundError:
+        raise TrainingError(f"{path}: no such file: train an agent with `c2iql train`") from None
+    except (SafetensorError, KeyError, TypeError, ValueError) as error:
+        raise TrainingError(f"{path}: not an agent of this version, or damaged: train it again ({error})") from error
+    return agent
+
+
+def save_checkpoint(agent: Agent, generators: list[torch.Generator], log: list[dict], run_dir: Path) -> None:
+    """metrics.csv first, then the checkpoint that vouches for it: a kill in between loses nothing."""
+    states = {f"generator.{run}": generator.get_state() for run, generator in enumerate(generators)}
+    run_dir.mkdir(parents=True, exist_ok=True)
+    temporary = run_dir / "metrics.tmp"
+    with open(temporary, "w", newline="") as file:
+        writer = csv.DictWriter(file, fieldnames=list(log[0]) if log else ["update"])
+        writer.writeheader()
+        writer.writerows(log)
+    os.replace(temporary, run_dir / METRICS)
+    save_agent(agent, run_dir / CHECKPOINT, **states)
+
+
+def _resume(agent: Agent, generators: list[torch.Generator], run_dir: Path) -> list[dict]:
+    """Bring agent and generators to the state of the folder's checkpoint; returns the log up to there."""
+    path = run_dir / CHECKPOINT
+    saved = load_agent(path)
+    mine = (agent.task, agent.name, agent.config, agent.seeds, agent.threshold)
+    if mine != (saved.task, saved.name, saved.config, saved.seeds, saved.threshold):
+        raise TrainingError(f"{path}: is of another run (task, algorithm, options or seeds): choose another folder")
+    with safe_open(path, "pt") as file:
+        agent.load_state({key: file.get_tensor(key) for key in file.keys()})  # noqa: SIM118
+        for run, generator in enumerate(generators):
+            generator.set_state(file.get_tensor(f"generator.{run}"))
+    with open(run_dir / METRICS, newline="") as file:
+        rows = [{key: float(value) for key, value in row.items()} for row in csv.DictReader(file)]
+    whole = {"seed", "update"}
+    return [{k: int(v) if k in whole else v for k, v in row.items()} for row in rows if row["update"] <= agent.updates]
