@@ -148,12 +148,15 @@ def test_tensors_hold_the_arrays_and_are_a_copy(dataset, arrays):
 
 def test_sampled_rows_belong_together_and_are_uniform(dataset):
     data = dataset.tensors()._replace(rewards=torch.arange(20.0))  # a reward now names its row
-    batch = datasets.sample_batch(data, 20_000, torch.Generator().manual_seed(0))
+    batch = datasets.sample_batch(data, 20_000, [torch.Generator().manual_seed(seed) for seed in (0, 1)])
     rows = batch.rewards.long()
     for values, all_values in zip(batch, data, strict=True):
         assert torch.equal(values, all_values[rows])
-    counts = torch.bincount(rows, minlength=20)
-    assert counts.min() > 850 and counts.max() < 1150  # 1000 expected, standard deviation 31
+    for run in rows:
+        counts = torch.bincount(run, minlength=20)
+        assert counts.min() > 850 and counts.max() < 1150  # 1000 expected, standard deviation 31
+    alone = datasets.sample_batch(data, 20_000, [torch.Generator().manual_seed(1)])
+    assert torch.equal(alone.rewards[0], batch.rewards[1])  # a run's batches do not depend on its neighbours
 
 
 def test_sampling_depends_on_the_generator_alone(dataset):
