@@ -161,7 +161,7 @@ def test_sampled_rows_belong_together_and_are_uniform(dataset):
 
 def test_sampling_depends_on_the_generator_alone(dataset):
     data = dataset.tensors()
-    draw = lambda seed: datasets.sample_batch(data, 8, torch.Generator().manual_seed(seed))  # noqa: E731
+    draw = lambda seed: datasets.sample_batch(data, 8, [torch.Generator().manual_seed(seed)])  # noqa: E731
     torch.manual_seed(1)
     first = draw(0)
     torch.manual_seed(2)
