@@ -24,7 +24,7 @@ from tqdm.auto import tqdm
 
 from tutorial_lib.datasets import Dataset, write_dataset
 from tutorial_lib.envs import make_env
-from tutorial_lib.tasks import Task, get_task
+from tutorial_lib.tasks import Task
 
 FIELDS = ("observations", "next_observations", "actions", "rewards", "costs", "terminals", "timeouts")
 
@@ -33,6 +33,8 @@ FIELDS = ("observations", "next_observations", "actions", "rewards", "costs", "t
 class Recipe:
     """How one task's data is collected."""
 
+    episodes: int
+    """About how many episodes the dataset keeps: DSRL's number."""
     steps: int = 2_000_000
     """Simulator steps of one PPO run."""
     prices: tuple[float, float] = (0.02, 4.0)
@@ -49,7 +51,19 @@ class Recipe:
     """Share of the run, after that, over which prices rise to their full size."""
 
 
-RECIPES = {name: Recipe() for name in ("BallRun", "BallCircle", "CarRun", "CarCircle")}
+RECIPES = {
+    "BallRun": Recipe(episodes=940),
+    "CarRun": Recipe(episodes=651),
+    "BallCircle": Recipe(episodes=886),
+    "CarCircle": Recipe(episodes=1_100),
+}
+
+
+def get_recipe(task: Task) -> Recipe:
+    """The recipe of a task, or ValueError where none has been found yet."""
+    if task.name not in RECIPES:
+        raise ValueError(f"{task.name} has no recipe yet: there are recipes for {', '.join(RECIPES)}")
+    return RECIPES[task.name]
 
 
 class PricedCost(gymnasium.Wrapper):
@@ -103,12 +117,14 @@ def run_ppo(task: Task, recipe: Recipe, seed: int, folder: Path, slice_steps: in
     model = _make_ppo(task, recipe, seed + 1000 * done, episodes, clock)
     if done:
         _load_ppo(model, folder / "state.safetensors")
-    bar = tqdm(total=slices * slice_steps, initial=done * slice_steps, desc=f"{task.name} seed {seed}", unit="step")
+    bar = tqdm(
+        total=slices * slice_steps, initial=done * slice_steps, desc=f"{task.name} seed {seed}", unit="step"
+    )
     for index in range(done, slices):
         started = time.perf_counter()
         goal = (index + 1) * slice_steps
         clock["progress"] = index / slices
-        ramp = (clock["progress"] - recipe.free_share) / recipe.ramp_share
+        ramp = ((index + 1) / slices - recipe.free_share) / recipe.ramp_share
         model.env.set_attr("price_scale", float(np.clip(ramp, 0, 1)))
         model.learn(goal - model.num_timesteps, reset_num_timesteps=False)
         arrays = {name: np.concatenate([e[name] for e in episodes]) for name in FIELDS}
@@ -120,17 +136,22 @@ def run_ppo(task: Task, recipe: Recipe, seed: int, folder: Path, slice_steps: in
 
 
 def collect(
-    task: Task | str, seeds: tuple[int, ...], recipe: Recipe, folder: Path, out: Path, episodes: int, workers: int = 2
+    task: Task, seeds: tuple[int, ...], recipe: Recipe, folder: Path, out: Path, workers: int = 2
 ) -> Dataset:
     """Run PPO for every seed (side by side, resumable), thin the episodes, and write the dataset to `out`."""
-    task = get_task(task) if isinstance(task, str) else task
     runs = [folder / task.name / f"seed-{seed}" for seed in seeds]
     joblib.Parallel(n_jobs=workers)(
         joblib.delayed(run_ppo)(task, recipe, seed, run) for seed, run in zip(seeds, runs, strict=True)
     )
     parts = [load_file(file) for run in runs for file in sorted(run.glob("episodes-*.safetensors"))]
     everything = Dataset(**{name: np.concatenate([part[name] for part in parts]) for name in FIELDS})
-    chosen = thin(everything.episode_costs, everything.episode_returns, episodes, task.cost_range)
+    chosen = thin(
+        everything.episode_costs,
+        everything.episode_returns,
+        recipe.episodes,
+        task.cost_range,
+        task.max_return,
+    )
     seconds = sum(float(load_file(run / "state.safetensors")["seconds"][0]) for run in runs)
     dataset = everything.select(chosen)
     write_dataset(
@@ -144,31 +165,42 @@ def collect(
             "recipe": str(asdict(recipe)),
             "collected_episodes": everything.num_episodes,
             "wall_seconds": round(seconds),
-            "versions": ", ".join(f"{p} {version(p)}" for p in ("stable-baselines3", "pybullet", "bullet-safety-gym", "torch")),
+            "versions": ", ".join(
+                f"{p} {version(p)}" for p in ("stable-baselines3", "pybullet", "bullet-safety-gym", "torch")
+            ),
             "licence": "CC BY 4.0",
         },
     )
     return dataset
 
 
-def thin(costs: np.ndarray, returns: np.ndarray, n: int, max_cost: float, cells: int = 20, seed: int = 0) -> np.ndarray:
-    """Indices of about n episodes of cost <= max_cost, spread evenly over a cells x cells grid of cost and return.
+def thin(
+    costs, returns, n: int, max_cost: float, max_return: float, cells: int = 20, seed: int = 0
+) -> np.ndarray:
+    """Indices of about n of the episodes within both bounds, even over cost, and within a cost over return.
 
-    Every occupied cell keeps at most k episodes, with the smallest k that gives n of them; within a
-    cell the choice is random. The best returns at every cost stay, and no cost drowns the others.
+    The bounds are DSRL's, so that normalised scores mean the same on both. The plane is cut into cells x
+    cells; every column of cost keeps at most k episodes, with the smallest k that gives n in all, and
+    fills them from its cells in turn, at random within a cell: no cost and no skill drowns the others.
     """
     rng = np.random.default_rng(seed)
-    within = rng.permutation(np.flatnonzero(costs <= max_cost))
-    low, high = returns[within].min(), returns[within].max()
+    within = rng.permutation(np.flatnonzero((costs <= max_cost) & (returns <= max_return)))
     column = np.minimum(costs[within] / max_cost * cells, cells - 1).astype(int)
+    low, high = returns[within].min(), returns[within].max()
     row = np.minimum((returns[within] - low) / max(high - low, 1e-9) * cells, cells - 1).astype(int)
-    cell = column * cells + row
-    order = np.argsort(cell, kind="stable")
-    first = np.searchsorted(cell[order], cell[order])
-    rank = np.empty(len(cell), int)
-    rank[order] = np.arange(len(cell)) - first  # 0, 1, 2 ... within each cell
-    k = np.sort(rank)[min(n, len(rank)) - 1] + 1 if len(rank) else 0
-    return np.sort(within[rank < k])
+    turn = _rank_within(column * cells + row, np.zeros(len(within)))  # 0, 1, 2 ... within each cell
+    place = _rank_within(column, turn)  # 0, 1, 2 ... within each column, cells taking turns
+    k = np.sort(place)[min(n, len(place)) - 1] + 1
+    return np.sort(within[place < k])
+
+
+def _rank_within(group: np.ndarray, key: np.ndarray) -> np.ndarray:
+    """The rank of every item among those of its group, by key; ties in their order."""
+    order = np.lexsort((key, group))
+    first = np.searchsorted(group[order], group[order])
+    rank = np.empty(len(group), int)
+    rank[order] = np.arange(len(group)) - first
+    return rank
 
 
 def _make_ppo(task: Task, recipe: Recipe, seed: int, episodes: list[dict], clock: dict[str, float]):
@@ -176,7 +208,9 @@ def _make_ppo(task: Task, recipe: Recipe, seed: int, episodes: list[dict], clock
     from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
     rngs = np.random.default_rng(seed).spawn(16)
-    envs = VecNormalize(DummyVecEnv([lambda rng=rng: PricedCost(task, recipe, rng, episodes) for rng in rngs]))
+    envs = VecNormalize(
+        DummyVecEnv([lambda rng=rng: PricedCost(task, recipe, rng, episodes) for rng in rngs])
+    )
     first, last = recipe.learning_rate
 
     def learning_rate(_):  # stable-baselines3's own progress starts anew with every slice
@@ -184,7 +218,14 @@ def _make_ppo(task: Task, recipe: Recipe, seed: int, episodes: list[dict], clock
 
     policy = {"net_arch": [64, 64], "log_std_init": -0.5}
     return PPO(
-        "MlpPolicy", envs, learning_rate, recipe.batch_steps // 16, 512, policy_kwargs=policy, seed=seed, device="cpu"
+        "MlpPolicy",
+        envs,
+        learning_rate,
+        recipe.batch_steps // 16,
+        512,
+        policy_kwargs=policy,
+        seed=seed,
+        device="cpu",
     )
 
 
@@ -204,7 +245,9 @@ def _save_ppo(model, path: Path, seconds: float) -> None:
 def _load_ppo(model, path: Path) -> None:
     arrays = load_file(path)
     tensors = {key: torch.as_tensor(value) for key, value in arrays.items()}
-    model.policy.load_state_dict({k.removeprefix("policy."): v for k, v in tensors.items() if k.startswith("policy.")})
+    model.policy.load_state_dict(
+        {k.removeprefix("policy."): v for k, v in tensors.items() if k.startswith("policy.")}
+    )
     state = model.policy.optimizer.state_dict()
     for key, value in tensors.items():
         if key.startswith("adam."):

@@ -12,6 +12,9 @@ class Config:
     The defaults are the `paper` profile. Fields under "paper silent" are ours, each with its reason.
     """
 
+    profile: str = "paper"
+    """The name that results files carry."""
+
     # Table 4
     kappa_1: float = 0.7
     """Expectile of both value functions, V_r and V_c."""
@@ -61,6 +64,9 @@ class Config:
     """One threshold per transition (lower variance), or one per batch as Algorithm 2's line 5 reads."""
     infinite_at_test: bool = False
     """May the budget rule pick the infinite threshold? 'The closest value' never is infinite."""
+    unsafe_slope: float = 0.0
+    """What an unsafe action is worth: 0, as the paper's penalty, or minus this times its excess over the limit
+    (in cost ranges, times the size of Q_r), so that where all actions are unsafe the cheapest is best."""
     shift_rewards: bool = False
     """Train on rewards minus their dataset minimum. The zero penalty punishes only where Q_r > 0."""
 
@@ -68,6 +74,7 @@ class Config:
 PROFILES: dict[str, Config] = {"paper": Config()}
 PROFILES["small"] = dataclasses.replace(
     PROFILES["paper"],
+    profile="small",
     batch_size=256,
     hidden_width=128,
     crm_width=64,

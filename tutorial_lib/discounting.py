@@ -31,7 +31,9 @@ def misjudged(cost: np.ndarray, estimate: np.ndarray, limit: float, estimate_lim
     return Misjudged(float(np.mean(safe & ~accepted)), float(np.mean(~safe & accepted)))
 
 
-def random_cost_sequences(kind: str, n: int, horizon: int, rng: np.random.Generator, largest=None) -> np.ndarray:
+def random_cost_sequences(
+    kind: str, n: int, horizon: int, rng: np.random.Generator, largest=None
+) -> np.ndarray:
     """n sequences of 0/1 costs, (n, horizon) float32, whose totals are uniform on 0..largest (default: horizon).
 
     The paper's generator is unstated and decides how much discounting misjudges, so there are three:

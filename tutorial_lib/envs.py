@@ -50,11 +50,19 @@ class BulletTask(gymnasium.Env):
     def step(self, action):
         action = np.asarray(action, np.float32)
         if action.shape != (self.task.act_dim,):
-            raise ValueError(f"{self.task.name} takes actions of shape ({self.task.act_dim},), not {action.shape}")
+            raise ValueError(
+                f"{self.task.name} takes actions of shape ({self.task.act_dim},), not {action.shape}"
+            )
         observation, reward, terminated, _, info = self._sim.step(action)
         self._steps += 1
         truncated = self._steps >= self.task.horizon and not terminated
-        return observation.astype(np.float32), float(reward), terminated, truncated, {"cost": float(info["cost"])}
+        return (
+            observation.astype(np.float32),
+            float(reward),
+            terminated,
+            truncated,
+            {"cost": float(info["cost"])},
+        )
 
     def render(self):
         """The scene as (height, width, 3) uint8, drawn off-screen; None without `render_mode`."""
@@ -65,7 +73,9 @@ class BulletTask(gymnasium.Env):
         view = client.computeViewMatrixFromYawPitchRoll(
             camera.cam_base_pos, camera.cam_dist, camera.cam_yaw, camera.cam_pitch, 0, 2
         )
-        projection = client.computeProjectionMatrixFOV(fov=60, aspect=width / height, nearVal=0.1, farVal=100.0)
+        projection = client.computeProjectionMatrixFOV(
+            fov=60, aspect=width / height, nearVal=0.1, farVal=100.0
+        )
         pixels = client.getCameraImage(width, height, view, projection, renderer=client.ER_TINY_RENDERER)[2]
         return np.asarray(pixels, np.uint8).reshape(height, width, 4)[..., :3]
 

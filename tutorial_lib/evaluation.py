@@ -62,7 +62,9 @@ def rollout(agent: Agent, limits, seeds, run: int = 0) -> Rollout:
         if agent.conditioned:
             conditions[t] = condition(agent, limits, costs.sum(0), t)
         if t == 0:
-            predicted = agent.predicted_cost(observations, conditions[0] if agent.conditioned else limits, run)
+            predicted = agent.predicted_cost(
+                observations, conditions[0] if agent.conditioned else limits, run
+            )
         actions = agent.act(observations, conditions[t], run)
         for e in np.flatnonzero(alive):
             observations[e], rewards[t, e], terminated, _, info = envs[e].step(actions[e])
@@ -75,7 +77,7 @@ def rollout(agent: Agent, limits, seeds, run: int = 0) -> Rollout:
     return Rollout(rewards, costs, conditions, positions, lengths, predicted)
 
 
-def evaluate(agent: Agent, profile: str, thresholds=None, episodes: int = 10, workers: int = 1) -> pd.DataFrame:
+def evaluate(agent: Agent, thresholds=None, episodes: int = 10, workers: int = 1) -> pd.DataFrame:
     """Raw results: one row per run, threshold and episode, by default under the task's three thresholds.
 
     The episodes of a seed start alike under every threshold. More workers give the same rows, sooner.
@@ -89,11 +91,11 @@ def evaluate(agent: Agent, profile: str, thresholds=None, episodes: int = 10, wo
         for threshold in thresholds
         for first in range(0, episodes, EPISODES_TOGETHER)
     ]
-    frames = joblib.Parallel(n_jobs=workers)(joblib.delayed(_evaluate_job)(agent, profile, *job) for job in jobs)
+    frames = joblib.Parallel(n_jobs=workers)(joblib.delayed(_evaluate_job)(agent, *job) for job in jobs)
     return pd.concat(frames, ignore_index=True)
 
 
-def _evaluate_job(agent: Agent, profile: str, run: int, threshold: float, episodes: range) -> pd.DataFrame:
+def _evaluate_job(agent: Agent, run: int, threshold: float, episodes: range) -> pd.DataFrame:
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # small products: more threads are slower, and the workers are the cores
     seed = agent.seeds[run]
@@ -103,7 +105,7 @@ def _evaluate_job(agent: Agent, profile: str, run: int, threshold: float, episod
         {
             "task": agent.task.name,
             "algorithm": agent.name,
-            "profile": profile,
+            "profile": agent.config.profile,
             "seed": seed,
             "threshold": threshold,
             "episode": list(episodes),
@@ -141,7 +143,9 @@ def with_scores(results: pd.DataFrame) -> pd.DataFrame:
     parts = []
     for name, part in results.groupby("task", sort=False):
         rewards = normalised_return(part["return"], get_task(name))
-        parts.append(part.assign(reward_score=rewards, cost_score=normalised_cost(part["cost"], part["threshold"])))
+        parts.append(
+            part.assign(reward_score=rewards, cost_score=normalised_cost(part["cost"], part["threshold"]))
+        )
     return pd.concat(parts, ignore_index=True)
 
 
@@ -160,7 +164,9 @@ def summarise(results: pd.DataFrame, by=("task", "algorithm", "profile", "thresh
 def _interval(values: np.ndarray) -> tuple[float, float]:
     if len(values) < 2 or np.ptp(values) == 0:
         return float(values.mean()), float(values.mean())
-    interval = stats.bootstrap((values,), np.mean, method="percentile", rng=np.random.default_rng(0)).confidence_interval
+    interval = stats.bootstrap(
+        (values,), np.mean, method="percentile", rng=np.random.default_rng(0)
+    ).confidence_interval
     return float(interval.low), float(interval.high)
 
 

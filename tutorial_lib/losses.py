@@ -24,9 +24,15 @@ def expectile_loss(target: Tensor, value: Tensor, kappa: float) -> Tensor:
     return (expectile_weight(advantage, kappa).detach() * advantage.square()).mean()
 
 
-def penalised_q(q_reward: Tensor, cost: Tensor, limit: Tensor) -> Tensor:
-    """Eq. 11: Q_{r|c} = 1(cost <= limit) Q_r; all (B,). An infinite limit penalises nothing."""
-    return torch.where(cost <= limit, q_reward, 0.0)
+def penalised_q(q_reward: Tensor, cost: Tensor, limit: Tensor, slope: float = 0.0) -> Tensor:
+    """Eq. 11: Q_{r|c} = 1(cost <= limit) Q_r; all (B,). An infinite limit penalises nothing.
+
+    With a `slope` an unsafe action is worth -slope (cost - limit) instead of the paper's zero: then unsafe
+    actions are ranked, and where all are unsafe the cheapest is best. At zero that choice is arbitrary.
+    """
+    safe = cost <= limit
+    excess = torch.where(safe, 0.0, cost - limit)
+    return torch.where(safe, q_reward, -slope * excess)
 
 
 def td_target(reward: Tensor, gamma: Tensor | float, next_value: Tensor, mask: Tensor) -> Tensor:

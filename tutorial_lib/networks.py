@@ -59,7 +59,9 @@ class EnsembleLinear(nn.Module):
 class Critics(nn.Module):
     """k independent Q(s, a): (B, obs) and (B, act) to (k, B), or with m scales to m heads (k, B, m) (eq. 22)."""
 
-    def __init__(self, obs_dim: int, act_dim: int, config: Config, scale: float | tuple[float, ...], k: int = 2):
+    def __init__(
+        self, obs_dim: int, act_dim: int, config: Config, scale: float | tuple[float, ...], k: int = 2
+    ):
         super().__init__()
         self.k, self.scale = k, scale
         sizes = [obs_dim + act_dim] + [config.hidden_width] * config.hidden_layers + [_heads(scale)]

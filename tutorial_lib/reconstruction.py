@@ -48,7 +48,9 @@ def episode_sums(dataset: Dataset, task: Task) -> tuple[np.ndarray, np.ndarray]:
 
 def random_sums(task: Task, n: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Lines 9-12: sums of n random sequences, a third each of uniform, block and Beta-shaped times."""
-    parts = [random_cost_sequences(kind, -(-n // 3), task.horizon, rng) for kind in ("uniform", "block", "beta")]
+    parts = [
+        random_cost_sequences(kind, -(-n // 3), task.horizon, rng) for kind in ("uniform", "block", "beta")
+    ]
     costs = np.concatenate(parts)[rng.permutation(3 * -(-n // 3))[:n]]
     return discounted_sums(costs, task.gammas), costs.sum(1)
 

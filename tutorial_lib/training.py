@@ -49,7 +49,14 @@ def train(
     if not agent.updates:
         agent.prepare(dataset, progress)
     data = _training_data(dataset, agent)
-    bar = tqdm(total=steps, initial=agent.updates, desc=agent.name, unit="update", disable=not progress, mininterval=0.5)
+    bar = tqdm(
+        total=steps,
+        initial=agent.updates,
+        desc=agent.name,
+        unit="update",
+        disable=not progress,
+        mininterval=0.5,
+    )
     started, first = time.perf_counter(), agent.updates
     while agent.updates < steps:
         batch = sample_batch(data, agent.config.batch_size, generators)
@@ -100,15 +107,22 @@ def _check_finite(rows: list[dict]) -> None:
 
 def _summary(scalars: dict[str, torch.Tensor]) -> dict[str, str]:
     """What the progress bar shows: the losses and the safe fraction, averaged over the runs."""
-    shown = {name: value for name, value in scalars.items() if name.endswith("_loss") or name == "safe_fraction"}
+    shown = {
+        name: value for name, value in scalars.items() if name.endswith("_loss") or name == "safe_fraction"
+    }
     return {name.removesuffix("_loss"): f"{value.mean():.3g}" for name, value in shown.items()}
 
 
 # --- Files ---
 
 
-def save_agent(agent: Agent, path: Path, **extra: torch.Tensor) -> None:
-    """All tensors of an agent, with what is needed to build it again in the file's header. Atomic."""
+def save_agent(agent: Agent, path: Path) -> None:
+    """An agent to use: its networks, without what only training needs. Atomic."""
+    _save(agent, path, {k: v for k, v in agent.state().items() if not k.startswith(("adam.", "target."))})
+
+
+def _save(agent: Agent, path: Path, tensors: dict[str, torch.Tensor]) -> None:
+    """Tensors, with what is needed to build their agent again in the file's header."""
     header = {
         "task": agent.task.name,
         "algorithm": agent.name,
@@ -118,8 +132,7 @@ def save_agent(agent: Agent, path: Path, **extra: torch.Tensor) -> None:
     }
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_suffix(".tmp")
-    tensors = {key: value.detach().cpu().contiguous() for key, value in (agent.state() | extra).items()}
-    save_file(tensors, temporary, metadata=header)
+    save_file({key: value.cpu().contiguous() for key, value in tensors.items()}, temporary, metadata=header)
     os.replace(temporary, path)
 
 
@@ -140,8 +153,10 @@ def load_agent(path: Path | str, device="cpu") -> Agent:
         agent.load_state(tensors)
     except FileNotFoundError:
         raise TrainingError(f"{path}: no such file: train an agent with `c2iql train`") from None
-    except (SafetensorError, KeyError, TypeError, ValueError) as error:
-        raise TrainingError(f"{path}: not an agent of this version, or damaged: train it again ({error})") from error
+    except (SafetensorError, KeyError, TypeError, ValueError, RuntimeError) as error:
+        raise TrainingError(
+            f"{path}: not an agent of this version, or damaged: train it again ({error})"
+        ) from error
     return agent
 
 
@@ -155,7 +170,7 @@ def save_checkpoint(agent: Agent, generators: list[torch.Generator], log: list[d
         writer.writeheader()
         writer.writerows(log)
     os.replace(temporary, run_dir / METRICS)
-    save_agent(agent, run_dir / CHECKPOINT, **states)
+    _save(agent, run_dir / CHECKPOINT, agent.state() | states)
 
 
 def _resume(agent: Agent, generators: list[torch.Generator], run_dir: Path) -> list[dict]:
@@ -164,7 +179,9 @@ def _resume(agent: Agent, generators: list[torch.Generator], run_dir: Path) -> l
     saved = load_agent(path)
     mine = (agent.task, agent.name, agent.config, agent.seeds, agent.threshold)
     if mine != (saved.task, saved.name, saved.config, saved.seeds, saved.threshold):
-        raise TrainingError(f"{path}: is of another run (task, algorithm, options or seeds): choose another folder")
+        raise TrainingError(
+            f"{path}: is of another run (task, algorithm, options or seeds): choose another folder"
+        )
     with safe_open(path, "pt") as file:
         agent.load_state({key: file.get_tensor(key) for key in file.keys()})  # noqa: SIM118
         for run, generator in enumerate(generators):
@@ -172,4 +189,8 @@ def _resume(agent: Agent, generators: list[torch.Generator], run_dir: Path) -> l
     with open(run_dir / METRICS, newline="") as file:
         rows = [{key: float(value) for key, value in row.items()} for row in csv.DictReader(file)]
     whole = {"seed", "update"}
-    return [{k: int(v) if k in whole else v for k, v in row.items()} for row in rows if row["update"] <= agent.updates]
+    return [
+        {k: int(v) if k in whole else v for k, v in row.items()}
+        for row in rows
+        if row["update"] <= agent.updates
+    ]

@@ -8,7 +8,9 @@ from tutorial_lib.algorithms.c2iql import C2IQL, C2IQLWithoutCC, C2IQLWithoutCR
 from tutorial_lib.algorithms.ciql import CIQL
 from tutorial_lib.algorithms.iql import IQL
 
-ALGORITHMS: dict[str, type[Agent]] = {agent.name: agent for agent in (IQL, CIQL, C2IQLWithoutCR, C2IQLWithoutCC, C2IQL)}
+ALGORITHMS: dict[str, type[Agent]] = {
+    agent.name: agent for agent in (IQL, CIQL, C2IQLWithoutCR, C2IQLWithoutCC, C2IQL)
+}
 
 
 def get_algorithm(name: str) -> type[Agent]:

@@ -34,11 +34,20 @@ class Agent:
     targets: tuple[str, ...] = ()  # networks with a Polyak-averaged copy
 
     def __init__(
-        self, task: Task, config: Config, seeds: Sequence[int] = (0,), threshold: float | None = None, device="cpu"
+        self,
+        task: Task,
+        config: Config,
+        seeds: Sequence[int] = (0,),
+        threshold: float | None = None,
+        device="cpu",
     ):
         needs_threshold = self.constrained and not self.conditioned
         if needs_threshold != (threshold is not None):
-            verb = "is trained for one threshold: give it one" if needs_threshold else "takes no threshold to train"
+            verb = (
+                "is trained for one threshold: give it one"
+                if needs_threshold
+                else "takes no threshold to train"
+            )
             raise ValueError(f"{self.name} {verb}")
         self.task, self.config, self.seeds, self.device = task, config, tuple(seeds), torch.device(device)
         self.threshold = None if threshold is None else check_threshold(threshold)
@@ -48,10 +57,16 @@ class Agent:
         self.modules = {name: copy.deepcopy(net).to("meta") for name, net in runs[0].items()}
         self.parameters = {name: stack_module_state([run[name] for run in runs])[0] for name in self.modules}
         self.parameters = _map(self.parameters, lambda p: p.detach().to(self.device).requires_grad_())
-        self.target_parameters = _map({n: self.parameters[n] for n in self.targets}, lambda p: p.detach().clone())
+        self.target_parameters = _map(
+            {n: self.parameters[n] for n in self.targets}, lambda p: p.detach().clone()
+        )
         self.optimiser = torch.optim.Adam(
             [
-                {"params": list(params.values()), "lr": self.learning_rate(name), "base_lr": self.learning_rate(name)}
+                {
+                    "params": list(params.values()),
+                    "lr": self.learning_rate(name),
+                    "base_lr": self.learning_rate(name),
+                }
                 for name, params in self.parameters.items()
             ],
             fused=True,
@@ -64,7 +79,9 @@ class Agent:
         """The networks of one run, by name."""
         raise NotImplementedError
 
-    def losses(self, net: SimpleNamespace, batch: Batch, limit: Tensor) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    def losses(
+        self, net: SimpleNamespace, batch: Batch, limit: Tensor
+    ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
         """One run's losses and other scalars on a batch of B transitions.
 
         `net` holds the networks by name, and the target networks as `target_<name>`; `limit` is the
@@ -98,7 +115,9 @@ class Agent:
         the targets of Q see V from before this step. (IQL's code updates V first; at these learning
         rates the difference is one step's worth, and one joint step is faster.)
         """
-        limits = torch.stack([self.draw_limits(g, batch.rewards.shape[1]) for g in generators]).to(self.device)
+        limits = torch.stack([self.draw_limits(g, batch.rewards.shape[1]) for g in generators]).to(
+            self.device
+        )
         if len(self.seeds) == 1:  # the same function without the lift, which is not free
             squeezed = _map(self.parameters, lambda p: p[0]), _map(self.target_parameters, lambda p: p[0])
             loss, scalars = self._total(*squeezed, Batch(*(x[0] for x in batch)), limits[0])
@@ -112,7 +131,9 @@ class Agent:
         self.optimiser.param_groups[list(self.parameters).index("policy")]["lr"] *= self._cosine()
         self.optimiser.step()
         for name, averages in self.target_parameters.items():
-            torch._foreach_lerp_(list(averages.values()), list(self.parameters[name].values()), self.config.target_tau)
+            torch._foreach_lerp_(
+                list(averages.values()), list(self.parameters[name].values()), self.config.target_tau
+            )
         self.updates += 1
         return scalars
 
@@ -129,10 +150,12 @@ class Agent:
 
     def network(self, name: str, run: int = 0) -> Callable[..., Tensor]:
         """One network of one run, to be called."""
-        return _bind(self.modules[name], {key: value[run].detach() for key, value in self.parameters[name].items()})
+        return _bind(
+            self.modules[name], {key: value[run].detach() for key, value in self.parameters[name].items()}
+        )
 
     def state(self) -> dict[str, Tensor]:
-        """Every tensor that a resumed run needs, by a flat name."""
+        """Every tensor of the agent by a flat name: online.*, target.*, adam.* and the number of updates."""
         tensors = {f"online.{n}.{k}": v.detach() for n, p in self.parameters.items() for k, v in p.items()}
         tensors |= {f"target.{n}.{k}": v for n, p in self.target_parameters.items() for k, v in p.items()}
         for index, moments in self.optimiser.state_dict()["state"].items():
@@ -140,14 +163,18 @@ class Agent:
         return tensors | {"updates": torch.tensor(self.updates)}
 
     def load_state(self, tensors: dict[str, Tensor]) -> None:
-        """The inverse of `state`; optimiser moments may be absent. Raises KeyError for a missing tensor."""
+        """The inverse of `state`. Without adam.* and target.* the agent can act, and train on only afresh.
+
+        Raises KeyError for a missing tensor, RuntimeError for one of another shape.
+        """
         with torch.no_grad():
-            for kind, parameters in (("online", self.parameters), ("target", self.target_parameters)):
-                for name, params in parameters.items():
-                    for key, value in params.items():
-                        value.copy_(tensors[f"{kind}.{name}.{key}"])
-        state = self.optimiser.state_dict()
-        state["state"] = {}
+            for name, params in self.parameters.items():
+                for key, value in params.items():
+                    value.copy_(tensors[f"online.{name}.{key}"])
+            for name, params in self.target_parameters.items():
+                for key, value in params.items():
+                    value.copy_(tensors.get(f"target.{name}.{key}", self.parameters[name][key]))
+        state = self.optimiser.state_dict() | {"state": {}}
         for key, value in tensors.items():
             if key.startswith("adam."):
                 _, index, moment = key.split(".")
@@ -164,7 +191,9 @@ class Agent:
             torch.manual_seed(seed)
             return self.build()
 
-    def _total(self, parameters, target_parameters, batch: Batch, limit: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+    def _total(
+        self, parameters, target_parameters, batch: Batch, limit: Tensor
+    ) -> tuple[Tensor, dict[str, Tensor]]:
         """One run's losses, summed, and its scalars, as a function of its parameters."""
         online = {name: _bind(self.modules[name], p) for name, p in parameters.items()}
         target = {f"target_{name}": _bind(self.modules[name], p) for name, p in target_parameters.items()}
@@ -185,4 +214,6 @@ def _bind(module: nn.Module, parameters: dict[str, Tensor]) -> Callable[..., Ten
 
 
 def _map(parameters, function):
-    return {name: {key: function(value) for key, value in params.items()} for name, params in parameters.items()}
+    return {
+        name: {key: function(value) for key, value in params.items()} for name, params in parameters.items()
+    }

@@ -66,7 +66,9 @@ class C2IQL(Agent):
             q_cost = q_cost * (1 - gammas**horizon)
         if self.reconstructs:
             return self.reconstruction(q_cost)
-        return (q_cost / ((1 - gammas**horizon) / (1 - gammas) / horizon)).squeeze(-1)  # Q <= L~, times L / L~
+        return (q_cost / ((1 - gammas**horizon) / (1 - gammas) / horizon)).squeeze(
+            -1
+        )  # Q <= L~, times L / L~
 
     def losses(self, net, batch, limit):
         config, a = self.config, batch.actions
@@ -81,7 +83,8 @@ class C2IQL(Agent):
         q_cost = q_cost.take_along_dim(worst[None, :, None], 0).squeeze(0)  # (B, m)
 
         # Lines 9-10: constraint penalisation.
-        q = L.penalised_q(net.target_critics(s, a).amin(0), cost, limit)
+        slope = config.unsafe_slope * self.modules["value"].scale / self.task.cost_range
+        q = L.penalised_q(net.target_critics(s, a).amin(0), cost, limit, slope)
 
         # Lines 11-12: value function.
         v = net.value(s)
@@ -97,7 +100,9 @@ class C2IQL(Agent):
         critic_loss = L.td_loss(target, net.critics(s, a))
 
         # Lines 17-18: cost Q-value function, every gamma_i at once. (The paper prints V_c(s) in eq. 16: s' is meant.)
-        cost_target = L.td_target(batch.costs[:, None], self.gammas, net.cost_value(s_next), cost_mask[:, None])
+        cost_target = L.td_target(
+            batch.costs[:, None], self.gammas, net.cost_value(s_next), cost_mask[:, None]
+        )
         cost_critic_loss = L.td_loss(cost_target, net.cost_critics(s, a))
 
         # Lines 19-20: policy extraction.

@@ -40,7 +40,9 @@ class CIQL(Agent):
         target = L.td_target(batch.rewards, config.gamma, net.value(s_next), mask)
         critic_loss = L.td_loss(target, net.critics(s, a))
 
-        cost_target = L.td_target(batch.costs[:, None], config.gamma, net.cost_value(s_next), mask[:, None])  # eq. 16
+        cost_target = L.td_target(
+            batch.costs[:, None], config.gamma, net.cost_value(s_next), mask[:, None]
+        )  # eq. 16
         cost_critic_loss = L.td_loss(cost_target, net.cost_critics(s, a))
 
         weight = L.expectile_weight(q - v, config.kappa_2)
@@ -52,4 +54,7 @@ class CIQL(Agent):
             "cost_critic": cost_critic_loss,
             "policy": policy_loss,
         }
-        return losses, {"safe_fraction": (q_cost[:, 0] <= average_limit).float().mean(), "value_mean": v.mean()}
+        return losses, {
+            "safe_fraction": (q_cost[:, 0] <= average_limit).float().mean(),
+            "value_mean": v.mean(),
+        }

@@ -28,10 +28,14 @@ class IQL(Agent):
         v = net.value(s)
         value_loss = L.expectile_loss(q, v, self.config.kappa_1)  # eq. 6
 
-        target = L.td_target(batch.rewards, self.config.gamma, net.value(s_next), 1 - batch.terminals)  # eq. 7
+        target = L.td_target(
+            batch.rewards, self.config.gamma, net.value(s_next), 1 - batch.terminals
+        )  # eq. 7
         critic_loss = L.td_loss(target, net.critics(s, a))
 
-        weight = L.awr_weight((q - v) * 1000 / (self.task.max_return - self.task.min_return), self.config.awr_alpha)
+        weight = L.awr_weight(
+            (q - v) * 1000 / (self.task.max_return - self.task.min_return), self.config.awr_alpha
+        )
         policy_loss = L.policy_loss(weight, gaussian_log_prob(a, *net.policy(s)))  # eq. 8
 
         losses = {"value": value_loss, "critic": critic_loss, "policy": policy_loss}

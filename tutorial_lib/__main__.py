@@ -1,0 +1,160 @@
+"""The command line: `c2iql tasks | collect | fetch | train | evaluate | bench`.
+
+tyro turns functions and dataclasses into commands with help and types, so no option is written twice.
+"""
+
+import dataclasses
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import pandas as pd
+import tyro
+
+from tutorial_lib import evaluation, training
+from tutorial_lib.algorithms import get_algorithm
+from tutorial_lib.config import Config, get_profile
+from tutorial_lib.datasets import fetch_dataset, load_dataset
+from tutorial_lib.tasks import TASKS, get_task
+
+Positional = tyro.conf.Positional
+
+
+def tasks() -> None:
+    """List the tasks: horizon, dimensions, thresholds, reference returns."""
+    table = pd.DataFrame([dataclasses.asdict(task) for task in TASKS.values()])
+    print(table.drop(columns=["env_id", "dsrl_file"]).to_string(index=False))
+
+
+def fetch(task: Positional[str], directory: Path | None = None) -> None:
+    """Download DSRL's dataset of a task, and check it.
+
+    Args:
+        task: which task, e.g. CarCircle.
+        directory: where to; default DSRL_DATASET_DIR or ~/.dsrl/datasets.
+    """
+    fetch_dataset(task, directory)
+
+
+def collect(
+    task: Positional[str],
+    out: Path | None = None,
+    seeds: tuple[int, ...] = (0,),
+    steps: int | None = None,
+    episodes: int | None = None,
+    runs: Path = Path("runs/collect"),
+    workers: int = 2,
+) -> None:
+    """Make a dataset from the simulator: PPO at many cost prices, thinned on a cost-return grid.
+
+    A killed run continues where it was.
+
+    Args:
+        task: which task, e.g. BallCircle.
+        out: the file to write; default runs/collect/TASK.hdf5.
+        seeds: one PPO run each.
+        steps: simulator steps of each run; default the task's recipe.
+        episodes: about how many to keep; default the task's recipe.
+        runs: folder for what is kept between a kill and a resume.
+        workers: PPO runs side by side.
+    """
+    from tutorial_lib import collect as collecting  # pulls in stable-baselines3: slow to import
+
+    recipe = collecting.get_recipe(get_task(task))
+    changes = {"steps": steps, "episodes": episodes}
+    recipe = dataclasses.replace(
+        recipe, **{key: value for key, value in changes.items() if value is not None}
+    )
+    out = out or runs / f"{get_task(task).name}.hdf5"
+    dataset = collecting.collect(get_task(task), seeds, recipe, runs, out, workers)
+    print(f"{out}: {dataset.num_episodes} episodes, {len(dataset)} transitions")
+
+
+def train(
+    task: Positional[str],
+    algorithm: str = "C2IQL",
+    profile: str = "small",
+    seeds: tuple[int, ...] = (0,),
+    threshold: float | None = None,
+    data: str = "shipped",
+    out: Path | None = None,
+    device: str = "cpu",
+    option: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE")] = (),
+) -> None:
+    """Train an agent (several seeds together) and save it with its log; resumes a killed run.
+
+    Args:
+        task: which task, e.g. BallCircle.
+        algorithm: a name from the list that a wrong one prints.
+        profile: paper, or small, which trains in minutes on a laptop.
+        seeds: one run each, trained together.
+        threshold: the cost limit, for algorithms that are trained for one.
+        data: shipped, dsrl, or a file.
+        out: folder of the run; default runs/TASK/ALGORITHM-PROFILE.
+        device: cpu or cuda.
+        option: changes to the profile, e.g. kappa_2=0.7 time_limits=mask.
+    """
+    record, kind = get_task(task), get_algorithm(algorithm)
+    config = with_options(get_profile(profile), option)
+    suffix = "" if threshold is None else f"-{threshold:g}"
+    out = (
+        out
+        or Path("runs") / record.name / f"{algorithm.replace(' ', '-').replace('/', '')}{suffix}-{profile}"
+    )
+    agent = kind(record, config, seeds=seeds, threshold=threshold, device=device)
+    training.train(agent, load_dataset(record, data), run_dir=out)
+    training.save_agent(agent, out / "agent.safetensors")
+    print(
+        f"{out}/agent.safetensors: trained for {agent.updates} updates; its log is {out}/{training.METRICS}"
+    )
+
+
+def evaluate(
+    agent: Positional[Path],
+    out: Path | None = None,
+    thresholds: tuple[float, ...] | None = None,
+    episodes: int = 10,
+    workers: int = 2,
+) -> None:
+    """Run a trained agent in the simulator; print scores and save every episode.
+
+    Args:
+        agent: an agent.safetensors or a checkpoint.safetensors.
+        out: the CSV to write; default results.csv beside the agent.
+        thresholds: cost limits; default the task's three.
+        episodes: per seed and threshold.
+        workers: processes; the results do not depend on their number.
+    """
+    loaded = training.load_agent(agent)
+    results = evaluation.evaluate(loaded, thresholds, episodes, workers)
+    out = out or agent.parent / "results.csv"
+    evaluation.save_results(results, out)
+    print(evaluation.summarise(results).round(3).to_string(index=False))
+    print(f"{out}: {len(results)} episodes")
+
+
+def with_options(config: Config, options: tuple[str, ...]) -> Config:
+    """The config with `name=value` changes; values are read as the field's own type. Raises ValueError."""
+    fields = {field.name: field for field in dataclasses.fields(Config)}
+    arguments = []
+    for option in options:
+        name, equals, value = option.partition("=")
+        if not equals or name not in fields:
+            raise ValueError(f"--option {option}: write NAME=VALUE with one of {', '.join(fields)}")
+        arguments += [f"--{name}", value]
+    return tyro.cli(Config, default=config, args=arguments)
+
+
+def main() -> None:
+    """Entry point: errors that a user can mend are one line, without a traceback."""
+    commands = {f.__name__: f for f in (tasks, collect, fetch, train, evaluate)}
+    try:
+        tyro.extras.subcommand_cli_from_dict(
+            commands, prog="c2iql", description="Safe offline RL with C2IQL."
+        )
+    except (ValueError, training.TrainingError) as error:
+        sys.exit(f"c2iql: {error}")
+
+
+if __name__ == "__main__":
+    main()
