@@ -1,0 +1,155 @@
+"""Checks say nothing of what they found, but are loud where it is wrong; exercises say what is wrong."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tutorial_lib import checks
+from tutorial_lib.tasks import get_task
+
+NOTEBOOKS = Path(__file__).parents[1] / "notebooks"
+
+
+def test_check_prints_what_is_expected_and_not_what_was_found(capsys):
+    checks.check("mismatch rate", 0.2371, 0.23, 0.02)
+    assert capsys.readouterr().out == "OK  mismatch rate = 0.23 +/- 0.02\n"
+
+
+def test_check_prints_no_tolerance_where_there_is_none(capsys):
+    checks.check("heads", 3, 3)
+    assert capsys.readouterr().out == "OK  heads = 3\n"
+
+
+def test_check_takes_arrays(capsys):
+    checks.check("weights", np.array([0.1, 0.9]), [0.1, 0.9], 1e-6)
+    assert capsys.readouterr().out == "OK  weights = [0.1, 0.9] +/- 1e-06\n"
+    checks.check("all equal", np.array([2.0, 2.01]), 2, 0.02)
+
+
+@pytest.mark.parametrize("value", [0.26, 0.2, np.nan, np.inf])
+def test_check_fails_with_the_value(value):
+    with pytest.raises(AssertionError, match=r"FAILED  rate = .*expected 0.23 \+/- 0.02"):
+        checks.check("rate", value, 0.23, 0.02)
+
+
+def test_one_wrong_element_fails():
+    with pytest.raises(AssertionError):
+        checks.check("weights", [0.1, 0.9, 0.5], [0.1, 0.9, 0.6], 0.01)
+
+
+def test_an_array_does_not_broadcast_against_what_is_expected():
+    with pytest.raises(AssertionError, match="shape"):
+        checks.check("values", np.ones((2, 1)), np.ones(2))
+
+
+def test_check_at_most(capsys):
+    checks.check_at_most("cost", 30.0, 30)
+    assert capsys.readouterr().out == "OK  cost <= 30\n"
+    for value in (30.1, np.nan):
+        with pytest.raises(AssertionError, match="at most 30"):
+            checks.check_at_most("cost", value, 30)
+
+
+def test_check_that(capsys):
+    checks.check_that("it holds", [True, True])
+    assert capsys.readouterr().out == "OK  it holds\n"
+    with pytest.raises(AssertionError, match="1 of 3 cases"):
+        checks.check_that("it holds", np.array([True, False, True]))
+    with pytest.raises(AssertionError, match="FAILED  it holds: it does not$"):
+        checks.check_that("it holds", False)
+
+
+def test_the_set_up_is_checked(capsys):
+    checks.check_setup()
+    assert capsys.readouterr().out.count("OK  ") == 3
+
+
+def test_a_missing_package_is_found(monkeypatch):
+    monkeypatch.setattr(checks, "PACKAGES", ("numpy", "no-such-package"))
+    with pytest.raises(AssertionError, match="all packages are installed"):
+        checks.check_setup()
+
+
+# --- Exercises: the right answer passes, and every likely mistake is told apart ---
+
+
+def keeps_limit(costs, limit):
+    return np.mean(costs) <= limit
+
+
+def normalised_return(total, task):
+    return (total - task.min_return) / (task.max_return - task.min_return)
+
+
+def implicit_cost_value(q, v, q_cost, kappa):
+    weight = np.where(q - v < 0, 1 - kappa, kappa)
+    return (weight * q_cost).sum() / weight.sum()
+
+
+def condition(limit, spent, t, horizon, thresholds):
+    budget = (limit - spent) * horizon / (horizon - t)
+    return min(thresholds, key=lambda threshold: abs(threshold - budget))
+
+
+ANSWERS = {
+    checks.check_keeps_limit: keeps_limit,
+    checks.check_normalised_return: normalised_return,
+    checks.check_implicit_cost_value: implicit_cost_value,
+    checks.check_condition: condition,
+}
+MISTAKES = [
+    (checks.check_keeps_limit, lambda costs, limit: max(costs) <= limit, "expectation"),
+    (checks.check_keeps_limit, lambda costs, limit: np.mean(costs) < limit, "at most"),
+    (checks.check_keeps_limit, lambda costs, limit: np.median(costs) <= limit, "their mean is not"),
+    (checks.check_normalised_return, lambda total, task: total / task.max_return, "R_min is 0.38312"),
+    (checks.check_implicit_cost_value, lambda q, v, c, k: np.where(q < v, 1 - k, k) @ c, "divide by the sum"),
+    (checks.check_implicit_cost_value, lambda q, v, c, k: implicit_cost_value(v, q, c, k), "M is"),
+    (checks.check_implicit_cost_value, lambda q, v, c, k: implicit_cost_value(q, v + 1e-9, c, k), "as good"),
+    (checks.check_condition, lambda L, spent, t, T, choices: condition(L, spent, 0, T, choices), "double"),
+    (checks.check_condition, lambda L, spent, t, T, choices: condition(L, 0, t, T, choices), "rate of 20"),
+    (checks.check_condition, lambda L, spent, t, T, choices: (L - spent) * T / (T - t), "double"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("checker", ANSWERS, ids=lambda checker: checker.__name__)
+def test_the_right_answer_passes(checker, capsys):
+    assert checker(ANSWERS[checker]) is True
+    assert re.fullmatch(r"OK  \w+ is right in \d cases\n", capsys.readouterr().out)
+
+
+@pytest.mark.parametrize("checker, answer, hint", MISTAKES)
+def test_a_mistake_gets_its_hint_and_no_traceback(checker, answer, hint, capsys):
+    assert checker(answer) is False
+    said = capsys.readouterr().out
+    assert said.startswith("NOT YET  ") and hint in said and said.count("\n") == 1
+
+
+@pytest.mark.parametrize("checker", ANSWERS, ids=lambda checker: checker.__name__)
+def test_a_placeholder_and_an_error_are_told(checker, capsys):
+    assert checker(lambda *arguments: None) is False
+    assert "returns nothing" in capsys.readouterr().out
+    assert checker(lambda *arguments: 1 / 0) is False
+    assert "raised ZeroDivisionError" in capsys.readouterr().out
+
+
+# --- The symbol table of notebook 00 ---
+
+
+def test_names_are_found():
+    assert checks.named("tutorial_lib.tasks.get_task") is get_task
+    assert checks.named("tutorial_lib.config.Config.kappa_1") == 0.7
+    with pytest.raises(AttributeError):
+        checks.named("tutorial_lib.losses.no_such_loss")
+    with pytest.raises(ModuleNotFoundError):
+        checks.named("no_such_module.x")
+
+
+@pytest.mark.skipif(not (NOTEBOOKS / "00_start_here.ipynb").exists(), reason="the notebook is not there yet")
+def test_the_code_names_in_the_symbol_table_exist():
+    source = (NOTEBOOKS / "00_start_here.ipynb").read_text()
+    names = set(re.findall(r"`(tutorial_lib\.[\w.]+)`", source))
+    assert len(names) > 10
+    for name in names:
+        checks.named(name)

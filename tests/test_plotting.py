@@ -1,0 +1,204 @@
+"""Do the figures show what they are given: as many lines, dots and pictures, and limits at their height?"""
+
+import dataclasses
+
+import matplotlib
+import matplotlib.pyplot as plt
+import numpy as np
+import pandas as pd
+import pytest
+
+from tutorial_lib import plotting
+from tutorial_lib.algorithms import C2IQL
+from tutorial_lib.config import get_profile
+from tutorial_lib.datasets import Dataset
+from tutorial_lib.evaluation import Rollout
+from tutorial_lib.tasks import get_task
+
+LIMITS = (30, 50, 70)
+
+
+@pytest.fixture(autouse=True)
+def without_a_screen():
+    matplotlib.use("Agg")
+
+
+@pytest.fixture(scope="module")
+def agent():
+    """Untrained: these tests look at pictures, not at skill."""
+    config = dataclasses.replace(get_profile("small"), hidden_width=8, crm_width=8, crm_layers=1)
+    return C2IQL(get_task("BallCircle"), config)
+
+
+def played(task_name="BallCircle", episodes=3, cost_from=100):
+    """Episodes that go once around a circle of radius 8 (Circle) or drift off to y = 4 (Run)."""
+    task = get_task(task_name)
+    time = np.linspace(0, 1, task.horizon)
+    angle = 2 * np.pi * time
+    way = (np.stack([20 * time, 4 * time], 1) if "Run" in task_name
+           else 8 * np.stack([np.cos(angle), np.sin(angle)], 1))  # fmt: skip
+    shape = (task.horizon, episodes)
+    costs = np.zeros(shape)
+    costs[cost_from:] = 1
+    lengths = np.full(episodes, task.horizon)
+    positions = np.repeat(way[:, None], episodes, axis=1)
+    return Rollout(np.ones(shape), costs, np.full(shape, 30.0), positions, lengths, np.zeros(episodes))
+
+
+def results():
+    return pd.DataFrame(
+        {
+            "task": "BallCircle", "algorithm": "C2IQL", "profile": "small", "seed": 0,
+            "threshold": np.repeat(LIMITS, 4), "episode": np.tile(range(4), 3),
+            "return": np.arange(12) * 50.0, "cost": np.repeat(LIMITS, 4) - 5.0,
+            "predicted_cost": np.repeat(LIMITS, 4) - 3.0,
+        }
+    )  # fmt: skip
+
+
+def labelled(ax, label):
+    (found,) = [line for line in ax.lines if line.get_label() == label]
+    return found
+
+
+def test_a_figure_is_returned_closed_and_in_the_course_style_alone():
+    before = dict(matplotlib.rcParams)
+    figure = plotting.paths(played(), get_task("BallCircle"), LIMITS)
+    assert plt.get_fignums() == []
+    assert dict(matplotlib.rcParams) == before
+    assert figure.axes[0].xaxis.get_ticklabels()[0].get_fontsize() == plotting.STYLE["font.size"]
+
+
+def test_paths_has_a_panel_per_episode_and_marks_the_unsafe_steps():
+    figure = plotting.paths(played(cost_from=150), get_task("BallCircle"), LIMITS)
+    assert [ax.get_title().split(":")[0] for ax in figure.axes] == ["limit 30", "limit 50", "limit 70"]
+    for ax in figure.axes:
+        assert "cost 50, return 200" in ax.get_title()
+        unsafe = labelled(ax, "unsafe: outside").get_xydata()
+        assert 0 < len(unsafe) < 50 and np.all(np.abs(unsafe[:, 0]) > plotting.WALL_X)
+        assert np.hypot(*labelled(ax, "where the reward is highest").get_xydata().T) == pytest.approx(7)
+        assert sorted(patch.get_x() for patch in ax.patches) == [-6, 6]
+
+
+def test_paths_of_a_run_tell_outside_from_too_fast():
+    figure = plotting.paths(played("BallRun", cost_from=20), get_task("BallRun"), LIMITS)
+    outside = labelled(figure.axes[0], "unsafe: outside").get_xydata()
+    too_fast = labelled(figure.axes[0], "unsafe: too fast").get_xydata()
+    assert len(outside) + len(too_fast) == 80
+    assert np.all(outside[:, 1] > 2) and np.all(too_fast[:, 1] <= 2)
+
+
+def test_an_episode_that_ends_early_is_drawn_to_its_end():
+    short = played()._replace(lengths=np.array([40, 200, 200]))
+    figure = plotting.paths(short, get_task("BallCircle"), LIMITS)
+    ways = [labelled(ax, "the robot's way").get_xydata() for ax in figure.axes]
+    assert [len(way) for way in ways] == [40, 200, 200]
+
+
+def test_budget_draws_cost_limit_and_conditions():
+    figure = plotting.budget(played(), get_task("BallCircle"), LIMITS)
+    assert len(figure.axes) == 6
+    for ax, limit in zip(figure.axes[:3], LIMITS, strict=True):
+        assert set(labelled(ax, "limit").get_ydata()) == {limit}
+        spent = labelled(ax, "cost so far").get_ydata()
+        assert (spent[0], spent[100], spent[-1]) == (0, 0, 100)
+    for ax, limit in zip(figure.axes[3:], LIMITS, strict=True):
+        assert set(labelled(ax, "threshold given").get_ydata()) == {30}
+        wish = labelled(ax, "eq. 23: budget left, rescaled").get_ydata()
+        assert wish[0] == limit and wish[50] == pytest.approx(limit * 200 / 150)  # 50 steps without a cost
+
+
+def test_an_infinite_condition_has_a_place_and_a_name():
+    conditions = np.full((200, 1), np.inf)
+    figure = plotting.budget(played(episodes=1)._replace(conditions=conditions), get_task("BallCircle"), [70])
+    ax = figure.axes[1]
+    assert set(labelled(ax, "threshold given").get_ydata()) == {120}
+    assert ax.get_yticklabels()[-1].get_text() == "∞"
+
+
+def test_episode_draws_the_one_asked_for():
+    short = played()._replace(lengths=np.array([200, 60, 200]))
+    figure = plotting.episode(short, get_task("BallCircle"), 50, e=1)
+    assert len(labelled(figure.axes[0], "the robot's way").get_xydata()) == 60
+    assert set(labelled(figure.axes[1], "limit").get_ydata()) == {50}
+
+
+def test_film_takes_a_picture_at_every_step_asked_for_and_counts_the_cost(agent):
+    frames, costs = plotting.film(agent, 30, seed=1, steps=[0, 3, 6], image_size=(64, 48))
+    assert frames.shape == (3, 48, 64, 3) and frames.dtype == np.uint8
+    assert costs.tolist() == [0, 0, 0]  # it starts on the inside
+    assert not np.array_equal(frames[0], frames[2])
+
+
+def test_film_shows_no_red_sphere_before_the_first_unsafe_step(agent):
+    frames, _ = plotting.film(agent, 30, seed=1, steps=[0, 5], image_size=(160, 120))
+    red = (frames[..., 0] > 180) & (frames[..., 1] < 60) & (frames[..., 2] < 60)
+    assert not red.any()
+
+
+def test_multiple_exposure_keeps_the_scene_and_adds_every_frame():
+    frames = np.full((5, 8, 8, 3), 200, np.uint8)
+    for i in range(5):
+        frames[i, i, 2] = 0
+    picture = plotting.multiple_exposure(frames)
+    assert picture[7, 7].tolist() == [200] * 3
+    shades = picture[range(5), 2, 0]
+    assert shades[-1] == 0 and np.all(np.diff(shades.astype(int)) < 0)  # the older, the paler
+
+
+def test_robot_at_limits_has_a_picture_per_limit(agent):
+    figure = plotting.robot_at_limits(agent, (30, 70), seed=1)
+    assert [len(ax.images) for ax in figure.axes] == [1, 1]
+    assert [ax.get_title() for ax in figure.axes] == ["at most 30 unsafe steps", "at most 70 unsafe steps"]
+
+
+def test_frames_strip_says_step_and_cost():
+    figure = plotting.frames_strip(np.zeros((2, 6, 8, 3), np.uint8), [0.0, 7.0], [10, 90], 30)
+    assert [ax.get_title() for ax in figure.axes] == ["step 10", "step 90"]
+    assert figure.axes[1].get_xlabel() == "cost 7 of 30"
+
+
+def test_learning_curves_draw_a_line_per_seed_from_log_or_file(tmp_path):
+    log = [{"seed": s, "update": u, "policy_loss": 1.0 / u + s} for u in (10, 20, 30) for s in (0, 1)]
+    path = tmp_path / "metrics.csv"
+    pd.DataFrame(log).to_csv(path, index=False)
+    for source in (log, path, str(path)):
+        figure = plotting.learning_curves(source, ["policy_loss"])
+        (ax,) = figure.axes
+        assert len(ax.lines) == 2
+        assert ax.lines[1].get_xydata() == pytest.approx(np.array([[10, 1.1], [20, 1.05], [30, 1 + 1 / 30]]))
+
+
+def test_learning_curves_hide_the_panels_that_are_left():
+    log = [{"seed": 0, "update": 1, "a": 1.0, "b": 2.0, "c": 3.0, "d": 4.0}]
+    figure = plotting.learning_curves(log, ["a", "b", "c", "d"])
+    assert [ax.get_visible() for ax in figure.axes] == [True] * 4 + [False] * 2
+
+
+def test_scores_draw_every_episode_and_the_limits_at_their_height():
+    figure = plotting.scores(results())
+    reward, cost = figure.axes
+    dots = [line for line in cost.lines if line.get_marker() == "o"]
+    assert sum(len(line.get_xdata()) for line in dots) == 12
+    assert sorted({y for line in dots for y in line.get_ydata()}) == pytest.approx([25, 45, 65])
+    dashed = [line for line in cost.lines if line.get_linestyle() == "--"]
+    assert [set(line.get_ydata()) for line in dashed] == [{30}, {50}, {70}]
+    assert not [line for line in reward.lines if line.get_linestyle() == "--"]
+
+
+def test_predicted_against_paid_has_a_panel_per_limit():
+    figure = plotting.predicted_against_paid(results())
+    for ax, limit in zip(figure.axes, LIMITS, strict=True):
+        assert labelled(ax, "episode").get_xydata() == pytest.approx(np.tile([limit - 3, limit - 5], (4, 1)))
+        assert set(labelled(ax, "limit").get_ydata()) == {limit}
+
+
+def test_cost_return_plane_has_a_dot_per_episode_and_a_line_per_threshold():
+    task = get_task("BallCircle")
+    zeros = np.zeros((6, 8), np.float32)
+    ends = np.array([0, 0, 1, 0, 0, 1], bool)
+    costs, rewards = np.array([1, 1, 0, 0, 0, 1], np.float32), np.arange(6, dtype=np.float32)
+    dataset = Dataset(zeros, zeros, zeros[:, :2], rewards, costs, np.zeros(6, bool), ends)
+    dots, *limits = plotting.cost_return_plane(dataset, task).axes[0].lines
+    assert dots.get_xydata().tolist() == [[2, 3], [1, 12]]
+    assert [line.get_xdata()[0] for line in limits] == [30, 50, 70]

@@ -1,0 +1,66 @@
+"""A slider's callback is a plain function: another limit, another picture. Code shown is the library's."""
+
+import dataclasses
+import io
+
+import matplotlib
+import numpy as np
+import pytest
+
+from tutorial_lib import widgets
+from tutorial_lib.algorithms import C2IQL
+from tutorial_lib.config import get_profile
+from tutorial_lib.tasks import get_task
+
+
+@pytest.fixture(scope="module")
+def agent():
+    matplotlib.use("Agg")
+    config = dataclasses.replace(get_profile("small"), hidden_width=8, crm_width=8, crm_layers=1)
+    return C2IQL(get_task("BallCircle"), config)
+
+
+def pixels(figure):
+    file = io.BytesIO()
+    figure.savefig(file, format="rgba")
+    return np.frombuffer(file.getvalue(), np.uint8)
+
+
+def test_play_draws_the_episode_under_the_limit(agent):
+    figure = widgets.play(agent, 40, 3)
+    assert figure.axes[0].get_title().startswith("limit 40: cost ")
+
+
+def test_the_same_numbers_give_the_same_picture_and_others_another(agent):
+    first = pixels(widgets.play(agent, 40, 3))
+    assert np.array_equal(pixels(widgets.play(agent, 40, 3)), first)
+    assert not np.array_equal(pixels(widgets.play(agent, 60, 3)), first)
+    assert not np.array_equal(pixels(widgets.play(agent, 40, 4)), first)
+
+
+def test_moving_the_slider_draws_anew(agent, capsys):
+    control = widgets.limit_slider(agent, limit=40, seed=3)
+    limit, start = control.kwargs_widgets
+    assert control.result.axes[0].get_title().startswith("limit 40:")
+    limit.value = 60
+    assert control.result.axes[0].get_title().startswith("limit 60:")
+    assert (limit.min, limit.max, start.value) == (0, 80, 3)
+
+
+def test_a_reader_without_a_kernel_is_told_what_is_missing(agent, capsys):
+    assert repr(widgets.limit_slider(agent)) == "(Run the notebook for sliders: limit and start.)"
+
+
+@pytest.mark.parametrize("lines", [(6, 8), (9, 10), (11, 12), (13, 14), (15, 16), (17, 18), (19, 20)])
+def test_every_part_of_algorithm_2_can_be_shown(lines, capsys):
+    widgets.print_lines(C2IQL.losses, *lines)
+    shown = capsys.readouterr().out.splitlines()
+    assert shown[0].startswith(f"# Lines {lines[0]}-{lines[1]}:")
+    source = [line.strip() for line in widgets.inspect.getsource(C2IQL.losses).splitlines()]
+    assert len(shown) > 1 and all(line.strip() in source for line in shown)
+    assert not [line for line in shown[1:] if line.startswith("# Line")]
+
+
+def test_lines_that_no_comment_names_are_an_error():
+    with pytest.raises(ValueError, match="Lines 1-2"):
+        widgets.print_lines(C2IQL.losses, 1, 2)

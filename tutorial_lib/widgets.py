@@ -1,0 +1,47 @@
+"""What a notebook shows besides figures: sliders, and the library's own code.
+
+A control's callback is a plain function that returns a figure, so that it works, and is tested, without a
+widget; where no kernel runs (GitHub, the site), the static picture after the control is drawn by it too.
+"""
+
+import inspect
+
+import ipywidgets
+
+from tutorial_lib import plotting
+from tutorial_lib.evaluation import rollout
+
+SLIDER = {"continuous_update": False, "style": {"description_width": "initial"}}
+
+
+class Controls(ipywidgets.interactive):
+    """`ipywidgets.interactive`, with words for readers without a kernel."""
+
+    def __repr__(self):
+        names = " and ".join(widget.description for widget in self.kwargs_widgets)
+        return f"(Run the notebook for sliders: {names}.)"
+
+
+def play(agent, limit: float, seed: int):
+    """Plays one episode under a limit, and draws it: its way, its cost so far, and the thresholds given."""
+    return plotting.episode(rollout(agent, [limit], [seed]), agent.task, limit)
+
+
+def limit_slider(agent, limit: float = 40, seed: int = 7) -> Controls:
+    """`play` with a slider for the limit, up to the task's cost range, and one for the start."""
+    limits = ipywidgets.IntSlider(limit, 0, int(agent.task.cost_range), 5, description="limit", **SLIDER)
+    starts = ipywidgets.IntSlider(seed, 0, 20, 1, description="start", **SLIDER)
+    return Controls(lambda limit, seed: play(agent, limit, seed), limit=limits, seed=starts)
+
+
+def print_lines(function, first: int, last: int | None = None) -> None:
+    """Prints the paragraph of a function that its comment calls lines `first` to `last` (of Algorithm 2).
+
+    Raises ValueError where there is none.
+    """
+    words = f"Line {first}:" if last is None else f"Lines {first}-{last}:"
+    for paragraph in inspect.getsource(function).split("\n\n"):
+        if paragraph.lstrip().startswith(f"# {words}"):
+            print(inspect.cleandoc("\n" + paragraph))
+            return
+    raise ValueError(f"no paragraph of {function.__qualname__} starts with '# {words}'")
