@@ -40,22 +40,26 @@ class Recipe:
     prices: tuple[float, float] = (0.02, 4.0)
     """Range of the price of an unsafe step, in units of the task's best mean reward per step."""
     allowance_share: float = 0.5
-    """Share of episodes with a free allowance, uniform over the cost range; the others have none."""
+    """Share of episodes with a free allowance, at the highest price; the others have a price alone."""
+    allowances: tuple[float, float] = (0.0, 1.0)
+    """Range of the allowance, in cost ranges; below zero is zero."""
+    ramp: tuple[float, float] | None = (0.15, 0.5)
+    """Shares of the run between which prices rise from nothing to their full size: a robot that cannot move
+    yet would learn to stand still. None: full prices at once, where speed itself is unsafe and, once learned,
+    hard to unlearn."""
     learning_rate: tuple[float, float] = (1e-3, 3e-4)
     """PPO's learning rate at the first and at the last step."""
     batch_steps: int = 4096
     """Steps between two PPO updates, over 16 environments."""
-    free_share: float = 0.15
-    """Share of the run in which unsafe steps are free: a robot that cannot move yet would learn to stand still."""
-    ramp_share: float = 0.35
-    """Share of the run, after that, over which prices rise to their full size."""
 
+
+_RUN = {"prices": (0.2, 1.5), "allowance_share": 1.0, "allowances": (-0.2, 1.0), "ramp": None}
 
 RECIPES = {
-    "BallRun": Recipe(episodes=940),
-    "CarRun": Recipe(episodes=651),
-    "BallCircle": Recipe(episodes=886),
-    "CarCircle": Recipe(episodes=1_100),
+    "BallRun": Recipe(episodes=940, steps=1_000_000, **_RUN),
+    "CarRun": Recipe(episodes=651, steps=800_000, **_RUN),
+    "BallCircle": Recipe(episodes=886, steps=2_000_000),
+    "CarCircle": Recipe(episodes=1_100, steps=1_500_000),
 }
 
 
@@ -79,7 +83,8 @@ class PricedCost(gymnasium.Wrapper):
     def reset(self, *, seed=None, options=None):
         low, high = np.log(self.recipe.prices)
         if self.rng.random() < self.recipe.allowance_share:
-            self.log_price, self.allowance = high, self.rng.uniform(0, self.task.cost_range)
+            share = max(0.0, self.rng.uniform(*self.recipe.allowances))
+            self.log_price, self.allowance = high, share * self.task.cost_range
         else:
             self.log_price, self.allowance = self.rng.uniform(low, high), 0.0
         self.observation, info = self.env.reset(seed=int(self.rng.integers(2**31)))
@@ -124,8 +129,8 @@ def run_ppo(task: Task, recipe: Recipe, seed: int, folder: Path, slice_steps: in
         started = time.perf_counter()
         goal = (index + 1) * slice_steps
         clock["progress"] = index / slices
-        ramp = ((index + 1) / slices - recipe.free_share) / recipe.ramp_share
-        model.env.set_attr("price_scale", float(np.clip(ramp, 0, 1)))
+        scale = 1.0 if recipe.ramp is None else np.interp(clock["progress"], recipe.ramp, (0, 1))
+        model.env.set_attr("price_scale", float(scale))
         model.learn(goal - model.num_timesteps, reset_num_timesteps=False)
         arrays = {name: np.concatenate([e[name] for e in episodes]) for name in FIELDS}
         episodes.clear()
@@ -152,7 +157,7 @@ def collect(
         task.cost_range,
         task.max_return,
     )
-    seconds = sum(float(load_file(run / "state.safetensors")["seconds"][0]) for run in runs)
+    seconds = sum(float(load_file(run / "state.safetensors")["seconds"]) for run in runs)
     dataset = everything.select(chosen)
     write_dataset(
         out,
