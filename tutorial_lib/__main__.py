@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Annotated
 
 import pandas as pd
+import torch
 import tyro
 
 from tutorial_lib import evaluation, training
@@ -133,6 +134,32 @@ def evaluate(
     print(f"{out}: {len(results)} episodes")
 
 
+def bench(task: str = "BallCircle", workers: int | None = None, rounds: int = 3, device: str = "cpu") -> None:
+    """Measure this machine, in about a minute: how fast agents train, and how fast simulators step.
+
+    The table of training has updates per second, the hours that all the profile's updates take, and the share
+    of the time of each part of an update. The table of simulation compares with the bare simulator's speed
+    times the processes. What else runs on the machine counts, too.
+
+    Args:
+        task: which task's simulator and sizes.
+        workers: processes for rollouts; default one for each core.
+        rounds: how often each speed is measured; the median is shown.
+        device: of the training: cpu or cuda.
+    """
+    from tutorial_lib import bench as benchmarks
+
+    record = get_task(task)
+    training_speeds, simulation_speeds = benchmarks.bench(record, workers, rounds, device=device)
+    print(f"C2IQL on {record.name}, {device}, {torch.get_num_threads()} thread(s): shares of an update")
+    shares = dict.fromkeys(benchmarks.PARTS, "{:.0%}".format)
+    others = {"updates_per_second": "{:.1f}".format, "hours": "{:.2f}".format}
+    print(training_speeds.to_string(index=False, formatters=shares | others))
+    print(f"\nSimulator of {record.name}: steps per second, and their share of bare simulator x processes")
+    formats = {"steps_per_second": "{:.0f}".format, "of_bare": "{:.0%}".format}
+    print(simulation_speeds.to_string(index=False, formatters=formats))
+
+
 def with_options(config: Config, options: tuple[str, ...]) -> Config:
     """The config with `name=value` changes; values are read as the field's own type. Raises ValueError."""
     fields = {field.name: field for field in dataclasses.fields(Config)}
@@ -147,7 +174,7 @@ def with_options(config: Config, options: tuple[str, ...]) -> Config:
 
 def main() -> None:
     """Entry point: errors that a user can mend are one line, without a traceback."""
-    commands = {f.__name__: f for f in (tasks, collect, fetch, train, evaluate)}
+    commands = {f.__name__: f for f in (tasks, collect, fetch, train, evaluate, bench)}
     try:
         tyro.extras.subcommand_cli_from_dict(
             commands, prog="c2iql", description="Safe offline RL with C2IQL."
