@@ -46,6 +46,6 @@ def nearest_threshold(budget, task: Task, with_infinite: bool = False) -> np.nda
     """
     choices = threshold_set(task) if with_infinite else np.asarray(task.thresholds, float)
     places = np.where(np.isinf(choices), INFINITE_CODE * task.cost_range, choices)
-    budget = np.clip(np.asarray(budget, float), places[0], places[-1])  # an infinite one is equally far from all
+    budget = np.clip(np.asarray(budget, float), places[0], places[-1])  # infinity is as far from all
     distance = np.abs(budget[..., None] - places)
     return choices[distance.argmin(axis=-1)]

@@ -1,8 +1,8 @@
 """Bullet tasks behind gymnasium's API: truly seeded, with the cost in a field of its own.
 
-The simulator, `bullet-safety-gym`, ignores `reset(seed=...)`: it draws from NumPy's global generator
-and lets the motor commands of one episode act on the first instant of the next. Both are mended
-here, so a seed names an episode whatever ran before it.
+The simulator, `bullet-safety-gym`, ignores `reset(seed=...)`: it draws from NumPy's global generator,
+and the motor commands and contacts of one episode act on the first instant of the next. Both are
+mended here, so a seed names an episode whatever ran before it.
 """
 
 import contextlib
@@ -31,17 +31,18 @@ class BulletTask(gymnasium.Env):
         self.task = get_task(task) if isinstance(task, str) else task
         self.render_mode = render_mode
         self.image_size = image_size
-        self._sim = _make_simulator(self.task.env_id)
+        with _global_numpy_seed(0):
+            self._sim = _make_simulator(self.task.env_id)
+            self._sim.reset()  # the simulator saves its state at its first reset, and restores it at others
         limit = np.full(self.task.obs_dim, 1000.0, np.float32)
         self.observation_space = gymnasium.spaces.Box(-limit, limit, dtype=np.float32)
         one = np.ones(self.task.act_dim, np.float32)
         self.action_space = gymnasium.spaces.Box(-one, one, dtype=np.float32)
         self._steps = 0
-        self._sim.reset()  # the simulator saves its state at its first reset and restores it at the others
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
-        self._motors_off()
+        self._forget_last_episode()
         with _global_numpy_seed(int(self.np_random.integers(2**32))):
             observation, _ = self._sim.reset()
         self._steps = 0
@@ -87,9 +88,11 @@ class BulletTask(gymnasium.Env):
         """The robot's (x, y) in metres: what the Run and Circle costs look at."""
         return self._sim.agent.get_position()[:2]
 
-    def _motors_off(self):
-        """Forget the last episode's motor commands: the simulator's reset steps the physics once."""
+    def _forget_last_episode(self):
+        """Drop the motor commands and contacts that the simulator keeps: its reset steps the physics once."""
         client, body = self._sim.bc, self._sim.agent.body_id
+        self._sim.agent.set_position((0, 0, 100))  # out of reach of everything, so that no contact is kept
+        client.performCollisionDetection()
         for joint in range(client.getNumJoints(body)):
             client.setJointMotorControl2(body, joint, client.VELOCITY_CONTROL, targetVelocity=0, force=0)
 
