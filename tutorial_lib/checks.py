@@ -49,7 +49,7 @@ def _text(value) -> str:
     if isinstance(value, Task):
         return value.name
     if np.ndim(value):
-        return np.array2string(np.asarray(value), precision=4, separator=", ", threshold=8)
+        return "[" + ", ".join(_text(element) for element in value) + "]"
     is_number = isinstance(value, int | float | np.number | np.ndarray) and not isinstance(value, bool)
     return f"{value:.5g}" if is_number else str(value)
 

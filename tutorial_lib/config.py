@@ -55,6 +55,9 @@ class Config:
     """What a time limit means to the cost critics. 'rate' bootstraps through it and scales head i by
     1 - gamma_i^T before the reconstruction; 'bootstrap' leaves out the factor; 'mask' stops there, so that
     the estimate is the remaining cost and is compared with the unscaled remaining budget."""
+    reward_time_limits: Literal["bootstrap", "mask"] = "mask"
+    """What a time limit means to V_r and Q_r. 'bootstrap' is IQL's code, 'mask' is OSRL's. The states at time
+    limits are never trained on, and in the Run tasks nothing like them is: bootstrapping there extrapolates."""
     cost_kappa: float | None = None
     """Expectile whose implicit policy the cost critics evaluate; None: kappa_1, as Algorithm 2. The policy
     that runs is extracted with kappa_2, so kappa_2 here evaluates (nearly) the policy that runs."""
@@ -62,8 +65,12 @@ class Config:
     """Ensemble of cost critics; the largest reconstruction counts. 1: a single critic."""
     thresholds_per: Literal["sample", "batch"] = "sample"
     """One threshold per transition (lower variance), or one per batch as Algorithm 2's line 5 reads."""
-    infinite_at_test: bool = False
-    """May the budget rule pick the infinite threshold? 'The closest value' never is infinite."""
+    infinite_at_test: Literal["covered", "nearest", "never"] = "covered"
+    """When the budget rule gives the policy the infinite threshold. 'covered': once the budget left covers
+    every step left, since costs are 0 or 1 and no behaviour can then break the limit; 'nearest': where its code
+    is closest to the rescaled budget; 'never': 'the closest value' is finite."""
+    normalise_observations: bool = True
+    """Give the networks observations of mean zero and variance one."""
     unsafe_slope: float = 0.0
     """What an unsafe action is worth: 0, as the paper's penalty, or minus this times its excess over the limit
     (in cost ranges, times the size of Q_r), so that where all actions are unsafe the cheapest is best."""

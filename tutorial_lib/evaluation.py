@@ -44,7 +44,10 @@ def condition(agent: Agent, limit: np.ndarray, spent: np.ndarray, t: int) -> np.
         budget = limit - spent
     else:
         budget = rescaled_budget(limit, spent, t, task.horizon)
-    return nearest_threshold(budget, task, with_infinite=config.infinite_at_test)
+    chosen = nearest_threshold(budget, task, with_infinite=config.infinite_at_test == "nearest")
+    if config.infinite_at_test == "covered":
+        chosen = np.where(limit - spent >= task.horizon - t, np.inf, chosen)
+    return chosen
 
 
 def rollout(agent: Agent, limits, seeds, run: int = 0) -> Rollout:

@@ -21,17 +21,19 @@ def _heads(scale: float | tuple[float, ...]) -> int:
 
 
 def _scaled(output: Tensor, scale: float | tuple[float, ...]) -> Tensor:
-    """(..., m) times its m scales, or (..., 1) times its one scale and squeezed to (...,)."""
+    """scale (1 + output): (..., m) with m scales, or (..., 1) with one, squeezed to (...,)."""
     if isinstance(scale, tuple):
-        return output * torch.tensor(scale, device=output.device)
-    return output.squeeze(-1) * scale
+        return (1 + output) * torch.tensor(scale, device=output.device)
+    return (1 + output.squeeze(-1)) * scale
 
 
 class Value(nn.Module):
     """V(s): observations (B, obs) to (B,), or with m scales to m heads (B, m) (eq. 22).
 
-    The output is multiplied by `scale`, the size that values are expected to have: the network then
-    learns numbers of order one, and heads of different discount learn at the same pace.
+    The network's output o is read as scale (1 + o), where `scale` is a first guess of the values: the
+    network learns numbers of order one, and heads of different discount start out in agreement. (From
+    zero, a head needs about 1 / (tau (1 - gamma)) updates to fill up, the slowest longest, and meanwhile
+    the reconstruction, which lives on the heads' differences, is far too low.)
     """
 
     def __init__(self, obs_dim: int, config: Config, scale: float | tuple[float, ...]):

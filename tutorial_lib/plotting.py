@@ -30,7 +30,7 @@ STYLE = {
     "axes.spines.top": False,
     "axes.spines.right": False,
     "lines.linewidth": 2.5,
-    "figure.dpi": 100,
+    "figure.dpi": 80,
     "figure.constrained_layout.use": True,
 }
 WALL_X, CIRCLE_RADIUS = 6.0, 7.0  # Circle tasks: unsafe where |x| > 6; the reward is highest on the circle
@@ -248,14 +248,19 @@ CURVES = {
     "policy_loss": "loss of the policy (line 20)",
     "safe_fraction": "share of safe actions",
 }
-REWARD_CURVES = ("value_loss", "critic_loss")
+SQUARED_ERRORS = {
+    "value_loss": REWARD,
+    "critic_loss": REWARD,
+    "cost_value_loss": COST,
+    "cost_critic_loss": COST,
+}
 
 
 @_one_figure
 def learning_curves(log, names=tuple(CURVES)):
     """Scalars of a training run over its updates, one panel each, one line per seed.
 
-    `log` is what `training.train` returns, or the path of a metrics.csv.
+    Squared errors have a logarithmic scale. `log` is what `training.train` returns, or the path of a metrics.csv.
     """
     rows = _read_log(log)
     columns = min(3, len(names))
@@ -264,11 +269,12 @@ def learning_curves(log, names=tuple(CURVES)):
         lines, columns, figsize=(4 * columns, 2.8 * lines), sharex=True, squeeze=False
     )
     for ax, name in zip(axes.flat, names, strict=False):
-        colour = COST if name.startswith("cost") else REWARD if name in REWARD_CURVES else LIMIT
         for seed in sorted({row["seed"] for row in rows}):
             x, y = zip(*[(row["update"], row[name]) for row in rows if row["seed"] == seed], strict=True)
-            ax.plot(x, y, color=colour, alpha=0.8)
+            ax.plot(x, y, color=SQUARED_ERRORS.get(name, LIMIT), alpha=0.8)
         ax.set_title(CURVES.get(name, name.replace("_", " ")))
+        if name in SQUARED_ERRORS:
+            ax.set_yscale("log")
     for ax in axes.flat[len(names) :]:
         ax.set_visible(False)
     for ax in axes[-1]:

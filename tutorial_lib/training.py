@@ -63,12 +63,15 @@ def train(
         scalars = agent.update(batch, generators)
         bar.update()
         last = agent.updates == steps
-        if last or agent.updates % log_every == 0:
+        logs = last or agent.updates % log_every == 0
+        saves = run_dir and (last or agent.updates % checkpoint_every == 0)
+        if logs or saves:  # what is not finite must not reach a checkpoint either
             rows = _rows(agent, scalars, (agent.updates - first) / (time.perf_counter() - started))
             _check_finite(rows)
+        if logs:
             log += rows
             bar.set_postfix(_summary(scalars))
-        if run_dir and (last or agent.updates % checkpoint_every == 0):
+        if saves:
             save_checkpoint(agent, generators, log, run_dir)
             if on_checkpoint:
                 on_checkpoint(agent)
@@ -153,9 +156,10 @@ def load_agent(path: Path | str, device="cpu") -> Agent:
         agent.load_state(tensors)
     except FileNotFoundError:
         raise TrainingError(f"{path}: no such file: train an agent with `c2iql train`") from None
-    except (SafetensorError, KeyError, TypeError, ValueError, RuntimeError) as error:
+    except (OSError, SafetensorError, KeyError, TypeError, ValueError, RuntimeError) as error:
+        reason = " ".join(str(error).split())  # PyTorch's take several lines
         raise TrainingError(
-            f"{path}: not an agent of this version, or damaged: train it again ({error})"
+            f"{path}: not an agent of this version, or damaged: train it again ({reason})"
         ) from error
     return agent
 
@@ -182,12 +186,17 @@ def _resume(agent: Agent, generators: list[torch.Generator], run_dir: Path) -> l
         raise TrainingError(
             f"{path}: is of another run (task, algorithm, options or seeds): choose another folder"
         )
-    with safe_open(path, "pt") as file:
-        agent.load_state({key: file.get_tensor(key) for key in file.keys()})  # noqa: SIM118
-        for run, generator in enumerate(generators):
-            generator.set_state(file.get_tensor(f"generator.{run}"))
-    with open(run_dir / METRICS, newline="") as file:
-        rows = [{key: float(value) for key, value in row.items()} for row in csv.DictReader(file)]
+    try:
+        with safe_open(path, "pt") as file:
+            agent.load_state({key: file.get_tensor(key) for key in file.keys()})  # noqa: SIM118
+            for run, generator in enumerate(generators):
+                generator.set_state(file.get_tensor(f"generator.{run}"))
+        with open(run_dir / METRICS, newline="") as file:
+            rows = [{key: float(value) for key, value in row.items()} for row in csv.DictReader(file)]
+    except (OSError, SafetensorError, TypeError, ValueError) as error:
+        raise TrainingError(
+            f"{run_dir}: {CHECKPOINT} or {METRICS} is missing or damaged: choose another folder ({error})"
+        ) from error
     whole = {"seed", "update"}
     return [
         {k: int(v) if k in whole else v for k, v in row.items()}

@@ -42,6 +42,6 @@ def print_lines(function, first: int, last: int | None = None) -> None:
     words = f"Line {first}:" if last is None else f"Lines {first}-{last}:"
     for paragraph in inspect.getsource(function).split("\n\n"):
         if paragraph.lstrip().startswith(f"# {words}"):
-            print(inspect.cleandoc("\n" + paragraph))
+            print(inspect.cleandoc("\n" + paragraph), end="\n\n")
             return
     raise ValueError(f"no paragraph of {function.__qualname__} starts with '# {words}'")

@@ -53,6 +53,8 @@ class Agent:
         self.threshold = None if threshold is None else check_threshold(threshold)
         self.gammas = torch.tensor(task.gammas, device=self.device)
 
+        self.observation_mean = torch.zeros(task.obs_dim, device=self.device)
+        self.observation_std = torch.ones(task.obs_dim, device=self.device)
         runs = [self._build_seeded(seed) for seed in self.seeds]
         self.modules = {name: copy.deepcopy(net).to("meta") for name, net in runs[0].items()}
         self.parameters = {name: stack_module_state([run[name] for run in runs])[0] for name in self.modules}
@@ -90,7 +92,10 @@ class Agent:
         raise NotImplementedError
 
     def prepare(self, dataset: Dataset, progress: bool = True) -> None:
-        """Whatever must be learned or filtered before the first update."""
+        """Whatever must be learned from the whole dataset before the first update."""
+        if self.config.normalise_observations:
+            self.observation_mean = self._tensor(dataset.observations.mean(0))
+            self.observation_std = self._tensor(dataset.observations.std(0)) + 1e-3
 
     def draw_limits(self, generator: torch.Generator, batch_size: int) -> Tensor:
         """The cost limits of one run's batch, (B,)."""
@@ -102,9 +107,16 @@ class Agent:
             return self.config.policy_lr
         return self.config.critic_lr if "critic" in name else self.config.value_lr
 
-    def policy_input(self, observations: Tensor, limit: Tensor) -> Tensor:
-        """What the policy sees: the observation, for conditioned agents with the encoded limit."""
-        return observations
+    def network_input(self, observations: Tensor, limit: Tensor) -> Tensor:
+        """What every network sees: the observation, for conditioned agents with the encoded limit."""
+        return (observations - self.observation_mean) / self.observation_std
+
+    def reward_mask(self, batch: Batch) -> Tensor:
+        """1 where Q_r bootstraps, 0 where nothing follows, (B,)."""
+        ends = batch.terminals
+        if self.config.reward_time_limits == "mask":
+            ends = torch.maximum(ends, batch.timeouts)
+        return 1 - ends
 
     # What they all share ----------------------------------------------------------------------------
 
@@ -141,7 +153,7 @@ class Agent:
         """Mean actions (E, act) of run number `run` at observations (E, obs) under cost limits (E,)."""
         with torch.no_grad():
             x = self._tensor(observations), self._tensor(limit)
-            mean, _ = self.network("policy", run)(self.policy_input(*x))
+            mean, _ = self.network("policy", run)(self.network_input(*x))
             return mean.cpu().numpy()
 
     def predicted_cost(self, observations, limit, run: int = 0) -> np.ndarray:
@@ -160,6 +172,7 @@ class Agent:
         tensors |= {f"target.{n}.{k}": v for n, p in self.target_parameters.items() for k, v in p.items()}
         for index, moments in self.optimiser.state_dict()["state"].items():
             tensors |= {f"adam.{index}.{key}": value for key, value in moments.items()}
+        tensors |= {"observation_mean": self.observation_mean, "observation_std": self.observation_std}
         return tensors | {"updates": torch.tensor(self.updates)}
 
     def load_state(self, tensors: dict[str, Tensor]) -> None:
@@ -180,6 +193,8 @@ class Agent:
                 _, index, moment = key.split(".")
                 state["state"].setdefault(int(index), {})[moment] = value
         self.optimiser.load_state_dict(state)
+        self.observation_mean.copy_(tensors["observation_mean"])
+        self.observation_std.copy_(tensors["observation_std"])
         self.updates = int(tensors["updates"])
 
     def __getstate__(self):
@@ -206,6 +221,17 @@ class Agent:
 
     def _tensor(self, x) -> Tensor:
         return torch.as_tensor(np.asarray(x, np.float32), device=self.device)
+
+
+def reward_guess(task: Task, config: Config) -> float:
+    """A first guess of Q_r and V_r: half of DSRL's best mean reward per step, for ever."""
+    return 0.5 * task.max_return / task.horizon / (1 - config.gamma)
+
+
+def cost_guess(task: Task, gammas: Sequence[float]) -> tuple[float, ...]:
+    """A first guess of the m heads of Q_c and V_c: the cost rate of the middle threshold, for ever."""
+    rate = task.thresholds[1] / task.horizon
+    return tuple(rate / (1 - gamma) for gamma in gammas)
 
 
 def _bind(module: nn.Module, parameters: dict[str, Tensor]) -> Callable[..., Tensor]:

@@ -6,7 +6,7 @@ Its two ablations are the classes below it, each one switch away.
 import torch
 
 from tutorial_lib import losses as L
-from tutorial_lib.algorithms.base import Agent
+from tutorial_lib.algorithms.base import Agent, cost_guess, reward_guess
 from tutorial_lib.conditioning import INFINITE_CODE, threshold_set
 from tutorial_lib.networks import Critics, Policy, Value, gaussian_log_prob
 from tutorial_lib.reconstruction import CostReconstruction, train_reconstruction
@@ -29,8 +29,8 @@ class C2IQL(Agent):
     def build(self):
         task, config = self.task, self.config
         inputs = task.obs_dim + self.conditioned
-        scale = task.max_return / task.horizon / (1 - config.gamma)
-        cost_scale = tuple(0.3 / (1 - gamma) for gamma in self.cost_gammas)
+        scale = reward_guess(task, config)
+        cost_scale = cost_guess(task, self.cost_gammas)
         return {
             "value": Value(inputs, config, scale),
             "cost_value": Value(inputs, config, cost_scale),
@@ -40,6 +40,12 @@ class C2IQL(Agent):
         }
 
     def prepare(self, dataset, progress=True):
+        super().prepare(dataset, progress)
+        rate = float(dataset.costs.mean()) / (self.task.thresholds[1] / self.task.horizon)
+        for parameters in (self.parameters, self.target_parameters):
+            for name in {"cost_value", "cost_critics"} & set(parameters):
+                last = list(parameters[name])[-1]; assert last.endswith("bias")
+                with torch.no_grad(): parameters[name][last].fill_(rate-1)
         if self.reconstructs:
             self.reconstruction = train_reconstruction(
                 self.task, self.config, dataset, device=self.device, progress=progress
@@ -53,7 +59,8 @@ class C2IQL(Agent):
         draws = batch_size if self.config.thresholds_per == "sample" else 1
         return choices[torch.randint(len(choices), (draws,), generator=generator)].expand(batch_size)
 
-    def policy_input(self, observations, limit):
+    def network_input(self, observations, limit):
+        observations = super().network_input(observations, limit)
         if not self.conditioned:
             return observations
         code = torch.where(limit.isinf(), INFINITE_CODE, limit / self.task.cost_range)
@@ -72,8 +79,8 @@ class C2IQL(Agent):
 
     def losses(self, net, batch, limit):
         config, a = self.config, batch.actions
-        s = self.policy_input(batch.observations, limit)
-        s_next = self.policy_input(batch.next_observations, limit)  # the same limit: it stands for a rate
+        s = self.network_input(batch.observations, limit)
+        s_next = self.network_input(batch.next_observations, limit)  # the same limit: it stands for a rate
         mask = 1 - batch.terminals
         cost_mask = mask * (1 - batch.timeouts) if config.time_limits == "mask" else mask
 
@@ -96,7 +103,7 @@ class C2IQL(Agent):
         cost_value_loss = L.cost_value_loss(weight, q_cost, v_cost)
 
         # Lines 15-16: Q-value function.
-        target = L.td_target(batch.rewards, config.gamma, net.value(s_next), mask)
+        target = L.td_target(batch.rewards, config.gamma, net.value(s_next), self.reward_mask(batch))
         critic_loss = L.td_loss(target, net.critics(s, a))
 
         # Lines 17-18: cost Q-value function, every gamma_i at once. (The paper prints V_c(s) in eq. 16: s' is meant.)
@@ -125,7 +132,7 @@ class C2IQL(Agent):
 
     def predicted_cost(self, observations, limit, run=0):
         with torch.no_grad():
-            s = self.policy_input(self._tensor(observations), self._tensor(limit))
+            s = self.network_input(self._tensor(observations), self._tensor(limit))
             action, _ = self.network("policy", run)(s)
             return self.episode_cost(self.network("cost_critics", run)(s, action)).amax(0).cpu().numpy()
 

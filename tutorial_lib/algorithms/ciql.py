@@ -1,7 +1,7 @@
 """Constrained implicit Q-learning (Section 3.1): IQL with a penalty, and costs under the same implicit policy."""
 
 from tutorial_lib import losses as L
-from tutorial_lib.algorithms.base import Agent
+from tutorial_lib.algorithms.base import Agent, cost_guess, reward_guess
 from tutorial_lib.discounting import average_threshold
 from tutorial_lib.networks import Critics, Policy, Value, gaussian_log_prob
 
@@ -14,8 +14,8 @@ class CIQL(Agent):
 
     def build(self):
         task, config = self.task, self.config
-        scale = task.max_return / task.horizon / (1 - config.gamma)
-        cost_scale = (0.3 / (1 - config.gamma),)  # one head; 0.3: an unsafe step in three
+        scale = reward_guess(task, config)
+        cost_scale = cost_guess(task, (config.gamma,))
         return {
             "value": Value(task.obs_dim, config, scale),
             "cost_value": Value(task.obs_dim, config, cost_scale),
@@ -25,7 +25,8 @@ class CIQL(Agent):
         }
 
     def losses(self, net, batch, limit):
-        config, s, a, s_next = self.config, batch.observations, batch.actions, batch.next_observations
+        config, a = self.config, batch.actions
+        s, s_next = (self.network_input(x, limit) for x in (batch.observations, batch.next_observations))
         mask = 1 - batch.terminals  # bootstrap through time limits, stop where the robot fell
         average_limit = average_threshold(limit, config.gamma, self.task.horizon)
 
@@ -37,7 +38,7 @@ class CIQL(Agent):
         weight = L.expectile_weight(q - v, config.kappa_1)  # Theorem 1
         cost_value_loss = L.cost_value_loss(weight, q_cost, net.cost_value(s))  # eq. 17
 
-        target = L.td_target(batch.rewards, config.gamma, net.value(s_next), mask)
+        target = L.td_target(batch.rewards, config.gamma, net.value(s_next), self.reward_mask(batch))
         critic_loss = L.td_loss(target, net.critics(s, a))
 
         cost_target = L.td_target(

@@ -1,7 +1,7 @@
 """Implicit Q-learning (Kostrikov et al. 2022), for rewards only: what CIQL and C2IQL start from."""
 
 from tutorial_lib import losses as L
-from tutorial_lib.algorithms.base import Agent
+from tutorial_lib.algorithms.base import Agent, reward_guess
 from tutorial_lib.networks import Critics, Policy, Value, gaussian_log_prob
 
 
@@ -14,7 +14,7 @@ class IQL(Agent):
 
     def build(self):
         task, config = self.task, self.config
-        scale = task.max_return / task.horizon / (1 - config.gamma)  # a discounted sum of typical rewards
+        scale = reward_guess(task, config)
         return {
             "value": Value(task.obs_dim, config, scale),
             "critics": Critics(task.obs_dim, task.act_dim, config, scale),
@@ -22,7 +22,8 @@ class IQL(Agent):
         }
 
     def losses(self, net, batch, limit):
-        s, a, s_next = batch.observations, batch.actions, batch.next_observations
+        a = batch.actions
+        s, s_next = (self.network_input(x, limit) for x in (batch.observations, batch.next_observations))
 
         q = net.target_critics(s, a).amin(0)
         v = net.value(s)

@@ -1,0 +1,100 @@
+"""Tables made from files: the datasheet of the shipped data and the results, in the Markdown that shows them.
+
+A page keeps a pair of comments, `<!-- NAME:begin -->` and `<!-- NAME:end -->`; what stands between them
+is written here and nowhere else, and a test fails where it is out of date.
+"""
+
+import hashlib
+from pathlib import Path
+
+import pandas as pd
+
+from tutorial_lib.datasets import SHIPPED_DATA, load_dataset
+from tutorial_lib.evaluation import summarise, with_scores
+from tutorial_lib.tasks import TASKS, get_task
+
+ROOT = SHIPPED_DATA.parent
+FIRST_LIGHT = SHIPPED_DATA / "results" / "first-light.csv"
+
+PAPER_C2IQL = {
+    "AntRun": (0.72, 1.00),
+    "BallRun": (0.59, 0.95),
+    "CarRun": (0.95, 0.08),
+    "DroneRun": (0.71, 0.73),
+    "AntCircle": (0.66, 0.76),
+    "BallCircle": (0.72, 0.85),
+    "CarCircle": (0.74, 0.93),
+    "DroneCircle": (0.78, 0.85),
+}
+"""The paper's Table 1, last rows: C2IQL's normalised reward and cost, on DSRL's data."""
+
+
+def shipped_tasks() -> list[str]:
+    """The tasks whose dataset is in `data/`."""
+    return [name for name in TASKS if (SHIPPED_DATA / f"{name}.hdf5").exists()]
+
+
+def datasheet() -> str:
+    """One row per shipped dataset: size, episodes, ranges, best returns at low and high cost, checksum."""
+    rows = []
+    for name in shipped_tasks():
+        task, path, data = get_task(name), SHIPPED_DATA / f"{name}.hdf5", load_dataset(name)
+        costs, returns = data.episode_costs, data.episode_returns
+        best = [f"{returns[costs <= limit].max():.0f} at {limit:g}" for limit in (0, *task.thresholds)]
+        rows.append(
+            {
+                "file": f"`{path.name}`",
+                "MB": f"{path.stat().st_size / 1e6:.1f}",
+                "episodes": f"{data.num_episodes} of {data.attributes['collected_episodes']}",
+                "transitions": f"{len(data):,}",
+                "cost": f"{costs.min():.0f} to {costs.max():.0f}, mean {costs.mean():.0f}",
+                "return": f"{returns.min():.0f} to {returns.max():.0f}",
+                "best return at a cost of at most": ", ".join(best),
+                "made with": f"`{data.attributes['made_by']}`, {int(data.attributes['wall_seconds']) // 60} min",
+                "SHA-256": f"`{hashlib.sha256(path.read_bytes()).hexdigest()}`",
+            }
+        )
+    return markdown(pd.DataFrame(rows))
+
+
+def results_table(path: Path = FIRST_LIGHT) -> str:
+    """C2IQL per task: scores per threshold with 95% intervals, and the paper's mean beside ours."""
+    results = pd.read_csv(path)
+    rows = []
+    for task, part in results.groupby("task", sort=False):
+        scores, row = with_scores(part), {"task": task}
+        for _, line in summarise(part).iterrows():
+            row[f"{get_task(task).cost_limit_names[line['threshold']]} limit: reward / cost"] = (
+                f"{line['reward_score']:.2f} [{line['reward_score_low']:.2f}, {line['reward_score_high']:.2f}] / "
+                f"{line['cost_score']:.2f} [{line['cost_score_low']:.2f}, {line['cost_score_high']:.2f}]"
+            )
+        row["mean: reward / cost"] = f"{scores['reward_score'].mean():.2f} / {scores['cost_score'].mean():.2f}"
+        paper = PAPER_C2IQL[task]
+        row["the paper's, on DSRL's data"] = f"{paper[0]:.2f} / {paper[1]:.2f}"
+        rows.append(row)
+    return markdown(pd.DataFrame(rows))
+
+
+def markdown(table: pd.DataFrame) -> str:
+    """A table in Markdown."""
+    lines = [table.columns, ["---"] * len(table.columns), *table.astype(str).values]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def between_marks(page: str, name: str, text: str) -> str:
+    """`page` with `text` between its marks called `name`. Raises ValueError where it has none."""
+    begin, end = f"<!-- {name}:begin -->", f"<!-- {name}:end -->"
+    if begin not in page or end not in page:
+        raise ValueError(f"the page has no marks {begin} and {end}")
+    head, rest = page.split(begin, 1)
+    return head + begin + "\n" + text + "\n" + end + rest.split(end, 1)[1]
+
+
+def pages() -> dict[Path, str]:
+    """Every page that holds made tables, as it should read now."""
+    data, readme = SHIPPED_DATA / "README.md", ROOT / "README.md"
+    sheet = between_marks(data.read_text(), "datasheet", datasheet())
+    return {
+        data: between_marks(sheet, "results", results_table()),
+        readme: between_marks(readme.read_text(), "results", results_table()),
+    }
