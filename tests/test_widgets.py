@@ -57,7 +57,7 @@ def test_every_part_of_algorithm_2_can_be_shown(lines, capsys):
     shown = capsys.readouterr().out.splitlines()
     assert shown[0].startswith(f"# Lines {lines[0]}-{lines[1]}:")
     source = [line.strip() for line in widgets.inspect.getsource(C2IQL.losses).splitlines()]
-    assert len(shown) > 1 and all(line.strip() in source for line in shown)
+    assert len(shown) > 1 and shown[-1] == "" and all(line.strip() in source for line in shown)
     assert not [line for line in shown[1:] if line.startswith("# Line")]
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 import matplotlib
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib import ticker
 
 from tutorial_lib.conditioning import INFINITE_CODE, rescaled_budget
 from tutorial_lib.envs import make_env
@@ -260,7 +261,7 @@ SQUARED_ERRORS = {
 def learning_curves(log, names=tuple(CURVES)):
     """Scalars of a training run over its updates, one panel each, one line per seed.
 
-    Squared errors have a logarithmic scale. `log` is what `training.train` returns, or the path of a metrics.csv.
+    Squared errors have a logarithmic scale. `log` is what `training.train` returns, or a metrics.csv.
     """
     rows = _read_log(log)
     columns = min(3, len(names))
@@ -275,6 +276,9 @@ def learning_curves(log, names=tuple(CURVES)):
         ax.set_title(CURVES.get(name, name.replace("_", " ")))
         if name in SQUARED_ERRORS:
             ax.set_yscale("log")
+            ax.yaxis.set_major_locator(ticker.LogLocator(subs=(1, 3)))
+            ax.yaxis.set_major_formatter("{x:g}")
+            ax.yaxis.set_minor_locator(ticker.NullLocator())
     for ax in axes.flat[len(names) :]:
         ax.set_visible(False)
     for ax in axes[-1]:
