@@ -110,7 +110,7 @@ class PricedCost(gymnasium.Wrapper):
 
 
 def run_ppo(task: Task, recipe: Recipe, seed: int, folder: Path, slice_steps: int = 100_000) -> None:
-    """One PPO run; after every slice its episodes and its state are on disk, and a killed run goes on from there."""
+    """One PPO run; every slice of it, once done, is on disk, and a killed run goes on from there."""
     torch.set_num_threads(1)
     folder.mkdir(parents=True, exist_ok=True)
     done = len(list(folder.glob("episodes-*.safetensors")))

@@ -49,6 +49,10 @@ class Config:
     """Iterations of Algorithm 1 (the paper says epochs; one pass over random data has no end)."""
     crm_noise: float = 0.1
     """Standard deviation of the noise on the reconstruction model's inputs, in discounted cost."""
+    crm_noise_rate: float = 0.0
+    """More of it, in cost per step: head i gets this over 1 - gamma_i. The model should expect the error that
+    the critics make; theirs is about 0.01 after some thousand updates, ten times what Table 4's 0.1 allows for,
+    and the model's alternating weights multiply it."""
 
     # Paper silent: we ...
     time_limits: Literal["rate", "bootstrap", "mask"] = "rate"

@@ -34,7 +34,7 @@ def misjudged(cost: np.ndarray, estimate: np.ndarray, limit: float, estimate_lim
 def random_cost_sequences(
     kind: str, n: int, horizon: int, rng: np.random.Generator, largest=None
 ) -> np.ndarray:
-    """n sequences of 0/1 costs, (n, horizon) float32, whose totals are uniform on 0..largest (default: horizon).
+    """n sequences of 0/1 costs, (n, horizon) float32; totals are uniform on 0..largest (default: horizon).
 
     The paper's generator is unstated and decides how much discounting misjudges, so there are three:
     'uniform' costs fall at any time; 'block' in one contiguous stretch; 'beta' early, late or in the

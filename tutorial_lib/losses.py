@@ -36,7 +36,7 @@ def penalised_q(q_reward: Tensor, cost: Tensor, limit: Tensor, slope: float = 0.
 
 
 def td_target(reward: Tensor, gamma: Tensor | float, next_value: Tensor, mask: Tensor) -> Tensor:
-    """Eqs. 7 and 16: r + gamma mask V(s'). For cost heads: reward (B, 1), gamma (m,), V (B, m), mask (B, 1)."""
+    """Eqs. 7 and 16: r + gamma mask V(s'). For m cost heads: r, mask (B, 1), gamma (m,), V (B, m)."""
     return reward + gamma * mask * next_value
 
 

@@ -59,7 +59,7 @@ class EnsembleLinear(nn.Module):
 
 
 class Critics(nn.Module):
-    """k independent Q(s, a): (B, obs) and (B, act) to (k, B), or with m scales to m heads (k, B, m) (eq. 22)."""
+    """k independent Q(s, a): (B, obs) and (B, act) to (k, B), with m scales to m heads (k, B, m) (eq. 22)."""
 
     def __init__(
         self, obs_dim: int, act_dim: int, config: Config, scale: float | tuple[float, ...], k: int = 2

@@ -35,7 +35,9 @@ class CostReconstruction(nn.Module):
         self.horizon = task.horizon
         self.register_buffer("mean", torch.zeros(m))
         self.register_buffer("whiten", torch.eye(m))
-        self.net = nn.Linear(m, 1) if config.crm == "linear" else mlp(m, config.crm_width, config.crm_layers, 1)
+        self.net = (
+            nn.Linear(m, 1) if config.crm == "linear" else mlp(m, config.crm_width, config.crm_layers, 1)
+        )
 
     def forward(self, discounted: Tensor) -> Tensor:
         return self.net((discounted - self.mean) @ self.whiten).squeeze(-1) * self.horizon
@@ -58,6 +60,12 @@ def random_sums(task: Task, n: int, rng: np.random.Generator) -> tuple[np.ndarra
     return discounted_sums(costs, task.gammas), costs.sum(1)
 
 
+def input_noise(task: Task, config: Config) -> Tensor:
+    """Standard deviations of the noise on the m inputs, (m,), in discounted cost."""
+    rate = config.crm_noise_rate / (1 - torch.tensor(task.gammas, dtype=torch.float64))
+    return (config.crm_noise**2 + rate**2).sqrt()
+
+
 def train_reconstruction(
     task: Task, config: Config, dataset: Dataset, seed: int = 0, device="cpu", progress: bool = True
 ) -> CostReconstruction:
@@ -68,12 +76,16 @@ def train_reconstruction(
         torch.manual_seed(seed)
         model = CostReconstruction(task, config).to(device)
     sums = [episode_sums(dataset, task), random_sums(task, POOL, rng)]
-    x, y = (torch.as_tensor(np.concatenate(part), dtype=torch.float64).to(device) for part in zip(*sums, strict=True))
+    x, y = (
+        torch.as_tensor(np.concatenate(part), dtype=torch.float64).to(device)
+        for part in zip(*sums, strict=True)
+    )
     half = [torch.full((len(part),), 0.5 / len(part), dtype=torch.float64) for _, part in sums]
     share = torch.cat(half).to(device)  # episodes and random sequences count for a half each
     model.mean.copy_(share @ x)
     centred = x - share @ x
-    covariance = centred.mT @ (share[:, None] * centred) + config.crm_noise**2 * torch.eye(x.shape[1]).to(x)
+    noise_std = input_noise(task, config).to(x)
+    covariance = centred.mT @ (share[:, None] * centred) + torch.diag(noise_std.square())
     model.whiten.copy_(torch.linalg.inv(torch.linalg.cholesky(covariance)).mT)
     if config.crm == "linear":
         # With whitened inputs, least squares is a mean; the noise in the covariance is its ridge penalty.
@@ -88,9 +100,11 @@ def train_reconstruction(
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, config.crm_steps)
     for _ in trange(config.crm_steps, desc="cost reconstruction", disable=not progress, leave=False):
         ends = ((0, boundary), (boundary, len(y)))
-        rows = torch.cat([torch.randint(*end, (config.batch_size // 2,), generator=generator) for end in ends])
+        rows = torch.cat(
+            [torch.randint(*end, (config.batch_size // 2,), generator=generator) for end in ends]
+        )
         rows = rows.to(device)
-        noise = config.crm_noise * torch.randn(len(rows), x.shape[1], generator=generator).to(device)
+        noise = noise_std.float() * torch.randn(len(rows), x.shape[1], generator=generator).to(device)
         loss = (model(x[rows] + noise) - y[rows]).square().mean() / task.horizon**2  # lines 7 and 14 at once
         optimiser.zero_grad()
         loss.backward()

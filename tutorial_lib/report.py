@@ -68,7 +68,9 @@ def results_table(path: Path = FIRST_LIGHT) -> str:
                 f"{line['reward_score']:.2f} [{line['reward_score_low']:.2f}, {line['reward_score_high']:.2f}] / "
                 f"{line['cost_score']:.2f} [{line['cost_score_low']:.2f}, {line['cost_score_high']:.2f}]"
             )
-        row["mean: reward / cost"] = f"{scores['reward_score'].mean():.2f} / {scores['cost_score'].mean():.2f}"
+        row["mean: reward / cost"] = (
+            f"{scores['reward_score'].mean():.2f} / {scores['cost_score'].mean():.2f}"
+        )
         paper = PAPER_C2IQL[task]
         row["the paper's, on DSRL's data"] = f"{paper[0]:.2f} / {paper[1]:.2f}"
         rows.append(row)

@@ -103,8 +103,8 @@ def _check_finite(rows: list[dict]) -> None:
         for name, value in row.items():
             if value - value != 0:  # NaN and both infinities
                 raise TrainingError(
-                    f"{name} is {value} at update {row['update']} of seed {row['seed']}: the last checkpoint is kept; "
-                    "try a smaller learning rate, and look at the data for outliers"
+                    f"{name} is {value} at update {row['update']} of seed {row['seed']}: "
+                    "the last checkpoint is kept; try a smaller learning rate, and look at the data for outliers"
                 )
 
 

@@ -157,8 +157,15 @@ class Agent:
             return mean.cpu().numpy()
 
     def predicted_cost(self, observations, limit, run: int = 0) -> np.ndarray:
-        """Whole-episode cost that the critics expect of the policy's action, (E,); NaN where there are none."""
+        """The episode cost that the critics expect of the policy's action, (E,); NaN where there are none."""
         return np.full(len(observations), np.nan)
+
+    def fill_last_bias(self, names: Sequence[str], value: float) -> None:
+        """Set the output bias of these networks, and of their target networks, in every run."""
+        with torch.no_grad():
+            for parameters in (self.parameters, self.target_parameters):
+                for name in set(names) & set(parameters):
+                    list(parameters[name].values())[-1].fill_(value)
 
     def network(self, name: str, run: int = 0) -> Callable[..., Tensor]:
         """One network of one run, to be called."""

@@ -41,15 +41,14 @@ class C2IQL(Agent):
 
     def prepare(self, dataset, progress=True):
         super().prepare(dataset, progress)
-        rate = float(dataset.costs.mean()) / (self.task.thresholds[1] / self.task.horizon)
-        for parameters in (self.parameters, self.target_parameters):
-            for name in {"cost_value", "cost_critics"} & set(parameters):
-                last = list(parameters[name])[-1]; assert last.endswith("bias")
-                with torch.no_grad(): parameters[name][last].fill_(rate-1)
         if self.reconstructs:
             self.reconstruction = train_reconstruction(
                 self.task, self.config, dataset, device=self.device, progress=progress
             )
+        # All cost heads start at the dataset's own cost rate: the closer the first guess, the less they
+        # disagree while they converge, and the reconstruction lives on their differences.
+        guess = float(dataset.costs.mean()) * self.task.horizon / self.task.thresholds[1]
+        self.fill_last_bias(("cost_value", "cost_critics"), guess - 1)
 
     def draw_limits(self, generator, batch_size):
         """Line 5. Paper silent on 'per batch' or 'per sample': per sample has the lower variance."""
@@ -106,7 +105,7 @@ class C2IQL(Agent):
         target = L.td_target(batch.rewards, config.gamma, net.value(s_next), self.reward_mask(batch))
         critic_loss = L.td_loss(target, net.critics(s, a))
 
-        # Lines 17-18: cost Q-value function, every gamma_i at once. (The paper prints V_c(s) in eq. 16: s' is meant.)
+        # Lines 17-18: cost Q-value function, every gamma_i at once. (Eq. 16 prints V_c(s); s' is meant.)
         cost_target = L.td_target(
             batch.costs[:, None], self.gammas, net.cost_value(s_next), cost_mask[:, None]
         )

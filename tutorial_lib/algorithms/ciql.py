@@ -1,4 +1,4 @@
-"""Constrained implicit Q-learning (Section 3.1): IQL with a penalty, and costs under the same implicit policy."""
+"""Constrained implicit Q-learning (Section 3.1): IQL with a penalty, and costs under the same policy."""
 
 from tutorial_lib import losses as L
 from tutorial_lib.algorithms.base import Agent, cost_guess, reward_guess
