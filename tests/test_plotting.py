@@ -1,12 +1,14 @@
 """Do the figures show what they are given: as many lines, dots and pictures, and limits at their height?"""
 
 import dataclasses
+import io
 
 import matplotlib
 import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 import pytest
+from PIL import Image
 
 from tutorial_lib import plotting
 from tutorial_lib.algorithms import C2IQL
@@ -67,6 +69,18 @@ def test_a_figure_is_returned_closed_and_in_the_course_style_alone():
     assert plt.get_fignums() == []
     assert dict(matplotlib.rcParams) == before
     assert figure.axes[0].xaxis.get_ticklabels()[0].get_fontsize() == plotting.STYLE["font.size"]
+
+
+def test_a_notebook_stores_a_figure_small_and_true():
+    figure = plotting.budget(played(), get_task("BallCircle"), LIMITS)
+    whole = io.BytesIO()
+    figure.savefig(whole, format="png", bbox_inches="tight")
+    stored = figure.small_png()
+    assert len(stored) < len(whole.getvalue()) / 2
+    before, after = (
+        np.asarray(Image.open(io.BytesIO(png)).convert("RGB"), int) for png in (whole.getvalue(), stored)
+    )
+    assert before.shape == after.shape and np.abs(before - after).mean() < 1
 
 
 def test_paths_has_a_panel_per_episode_and_marks_the_unsafe_steps():

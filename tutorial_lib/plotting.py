@@ -5,15 +5,20 @@ colour-blind readers tell apart). A figure is closed before it is returned, so a
 where it is the last value of a cell. `python -m tutorial_lib.plotting AGENT PNG` draws the README's.
 """
 
+import base64
 import csv
 import functools
+import io
 import sys
 from pathlib import Path
 
 import matplotlib
 import matplotlib.pyplot as plt
 import numpy as np
+from IPython.display import display
 from matplotlib import ticker
+from matplotlib.figure import Figure
+from PIL import Image
 
 from tutorial_lib.conditioning import INFINITE_CODE, rescaled_budget
 from tutorial_lib.envs import make_env
@@ -36,6 +41,25 @@ STYLE = {
 }
 WALL_X, CIRCLE_RADIUS = 6.0, 7.0  # Circle tasks: unsafe where |x| > 6; the reward is highest on the circle
 WALL_Y = 2.0  # Run tasks: unsafe where |y| > 2, and above a speed limit
+
+
+class Picture(Figure):
+    """A figure that a notebook stores in 128 colours: a third of the bytes, and no difference to see."""
+
+    def small_png(self) -> bytes:
+        """The picture in 128 colours."""
+        file, small = io.BytesIO(), io.BytesIO()
+        self.savefig(file, format="png", bbox_inches="tight")
+        image = Image.open(file).convert("RGB").quantize(128, dither=Image.Dither.NONE)
+        image.save(small, "PNG", optimize=True)
+        return small.getvalue()
+
+    def _ipython_display_(self):  # comes before matplotlib's own way, which _repr_png_ would not
+        png = base64.b64encode(self.small_png()).decode()
+        display({"image/png": png, "text/plain": repr(self)}, raw=True)
+
+
+_subplots = functools.partial(plt.subplots, FigureClass=Picture)
 
 
 def _one_figure(draw):
@@ -102,7 +126,7 @@ def robot_at_limits(agent, limits=None, seed: int = 7):
     limits = task.thresholds if limits is None else limits
     steps = range(task.horizon // 3, task.horizon // 3 + 40, 4)
     played = rollout(agent, limits, [seed] * len(limits))
-    figure, axes = plt.subplots(1, len(limits), figsize=(3.6 * len(limits), 3.5), squeeze=False)
+    figure, axes = _subplots(1, len(limits), figsize=(3.6 * len(limits), 3.5), squeeze=False)
     for e, (ax, limit) in enumerate(zip(axes[0], limits, strict=True)):
         frames, _ = film(agent, limit, seed, steps)
         ax.imshow(multiple_exposure(frames))
@@ -116,7 +140,7 @@ def robot_at_limits(agent, limits=None, seed: int = 7):
 @_one_figure
 def frames_strip(frames, costs, steps, limit: float):
     """Frames of an episode side by side, each with its step and the cost so far."""
-    figure, axes = plt.subplots(1, len(frames), figsize=(12, 12 / len(frames)), squeeze=False)
+    figure, axes = _subplots(1, len(frames), figsize=(12, 12 / len(frames)), squeeze=False)
     for ax, frame, cost, step in zip(axes[0], frames, costs, steps, strict=True):
         ax.imshow(frame)
         ax.set(xticks=[], yticks=[], title=f"step {step}")
@@ -134,7 +158,7 @@ def paths(played: Rollout, task: Task, limits):
     count = len(limits)
     run = "Run" in task.name
     shape, size = ((count, 1), (11, 2.6 * count)) if run else ((1, count), (4 * count, 4.9))
-    figure, axes = plt.subplots(*shape, figsize=size, sharex=True, sharey=True, squeeze=False)
+    figure, axes = _subplots(*shape, figsize=size, sharex=True, sharey=True, squeeze=False)
     for e, (ax, limit) in enumerate(zip(axes.flat, limits, strict=True)):
         _draw_path(ax, played, e, task)
         ax.set_title(f"limit {limit:g}: " + _summary(played, e, "cost {cost:.0f}, return {total:.0f}"))
@@ -147,7 +171,7 @@ def paths(played: Rollout, task: Task, limits):
 def budget(played: Rollout, task: Task, limits):
     """Each episode of a rollout: the cost so far against its limit; below, the threshold given (eq. 23)."""
     count = len(limits)
-    figure, axes = plt.subplots(
+    figure, axes = _subplots(
         2, count, figsize=(4 * count, 6), sharex=True, sharey="row", squeeze=False, height_ratios=(3, 2)
     )
     for e, limit in enumerate(limits):
@@ -165,7 +189,11 @@ def budget(played: Rollout, task: Task, limits):
 def episode(played: Rollout, task: Task, limit: float, e: int = 0):
     """One episode: from above, its cost so far against the limit, and the threshold given at each step."""
     figure, axes = plt.subplot_mosaic(
-        [["path", "cost"], ["path", "condition"]], figsize=(12, 6), height_ratios=(3, 2), width_ratios=(5, 6)
+        [["path", "cost"], ["path", "condition"]],
+        figsize=(12, 6),
+        height_ratios=(3, 2),
+        width_ratios=(5, 6),
+        FigureClass=Picture,
     )
     _draw_path(axes["path"], played, e, task)
     _draw_cost_so_far(axes["cost"], played, e, limit)
@@ -266,9 +294,7 @@ def learning_curves(log, names=tuple(CURVES)):
     rows = _read_log(log)
     columns = min(3, len(names))
     lines = -(-len(names) // columns)
-    figure, axes = plt.subplots(
-        lines, columns, figsize=(4 * columns, 2.8 * lines), sharex=True, squeeze=False
-    )
+    figure, axes = _subplots(lines, columns, figsize=(4 * columns, 2.8 * lines), sharex=True, squeeze=False)
     for ax, name in zip(axes.flat, names, strict=False):
         for seed in sorted({row["seed"] for row in rows}):
             x, y = zip(*[(row["update"], row[name]) for row in rows if row["seed"] == seed], strict=True)
@@ -299,7 +325,7 @@ def scores(results):
     table = summarise(results)
     place = {threshold: x for x, threshold in enumerate(sorted(table["threshold"]))}
     episodes = with_scores(results)
-    figure, axes = plt.subplots(1, 2, figsize=(12, 4.4))
+    figure, axes = _subplots(1, 2, figsize=(12, 4.4))
     panels = (("reward_score", REWARD, 1.0), ("cost_score", COST, None))
     for ax, (score, colour, unit) in zip(axes, panels, strict=True):
         for _, row in table.iterrows():
@@ -323,7 +349,7 @@ def scores(results):
 def predicted_against_paid(results):
     """The cost that the critics expected at an episode's first step, and what it paid: a panel per limit."""
     limits = sorted(results["threshold"].unique())
-    figure, axes = plt.subplots(
+    figure, axes = _subplots(
         1, len(limits), figsize=(4 * len(limits), 4.3), sharex=True, sharey=True, squeeze=False
     )
     end = 1.08 * max(results["predicted_cost"].max(), results["cost"].max(), *limits)
@@ -344,7 +370,7 @@ def predicted_against_paid(results):
 @_one_figure
 def cost_return_plane(dataset, task: Task):
     """Every episode of a dataset by its cost and its return, with the task's three thresholds."""
-    figure, ax = plt.subplots(figsize=(9, 5))
+    figure, ax = _subplots(figsize=(9, 5))
     ax.plot(dataset.episode_costs, dataset.episode_returns, "o", color=NEUTRAL, markersize=4, alpha=0.5)
     ax.set(xlabel="cost of the episode", ylabel="return of the episode")
     for threshold, word in task.cost_limit_names.items():
