@@ -75,9 +75,9 @@ class Config:
     is closest to the rescaled budget; 'never': 'the closest value' is finite."""
     normalise_observations: bool = True
     """Give the networks observations of mean zero and variance one."""
-    unsafe_slope: float = 0.0
-    """What an unsafe action is worth: 0, as the paper's penalty, or minus this times its excess over the limit
-    (in cost ranges, times the size of Q_r), so that where all actions are unsafe the cheapest is best."""
+    unsafe_slope: float | None = None
+    """What an unsafe action is worth. None: zero, the paper's penalty; where all actions are unsafe it leaves
+    the policy to chance. A number: Q_r minus so many times the typical Q_r per cost range of excess."""
     shift_rewards: bool = False
     """Train on rewards minus their dataset minimum. The zero penalty punishes only where Q_r > 0."""
 

@@ -24,15 +24,16 @@ def expectile_loss(target: Tensor, value: Tensor, kappa: float) -> Tensor:
     return (expectile_weight(advantage, kappa).detach() * advantage.square()).mean()
 
 
-def penalised_q(q_reward: Tensor, cost: Tensor, limit: Tensor, slope: float = 0.0) -> Tensor:
+def penalised_q(q_reward: Tensor, cost: Tensor, limit: Tensor, slope: float | None = None) -> Tensor:
     """Eq. 11: Q_{r|c} = 1(cost <= limit) Q_r; all (B,). An infinite limit penalises nothing.
 
-    With a `slope` an unsafe action is worth -slope (cost - limit) instead of the paper's zero: then unsafe
-    actions are ranked, and where all are unsafe the cheapest is best. At zero that choice is arbitrary.
+    With a `slope`, an unsafe action is worth Q_r - slope (cost - limit) instead of the paper's zero: unsafe
+    actions are then ranked, by reward and by how far they miss, also where all actions are unsafe.
     """
     safe = cost <= limit
-    excess = torch.where(safe, 0.0, cost - limit)
-    return torch.where(safe, q_reward, -slope * excess)
+    if slope is None:
+        return torch.where(safe, q_reward, 0.0)
+    return q_reward - slope * torch.where(safe, 0.0, cost - limit)
 
 
 def td_target(reward: Tensor, gamma: Tensor | float, next_value: Tensor, mask: Tensor) -> Tensor:

@@ -89,7 +89,9 @@ class C2IQL(Agent):
         q_cost = q_cost.take_along_dim(worst[None, :, None], 0).squeeze(0)  # (B, m)
 
         # Lines 9-10: constraint penalisation.
-        slope = config.unsafe_slope * self.modules["value"].scale / self.task.cost_range
+        slope = config.unsafe_slope
+        if slope is not None:
+            slope = slope * self.modules["value"].scale / self.task.cost_range
         q = L.penalised_q(net.target_critics(s, a).amin(0), cost, limit, slope)
 
         # Lines 11-12: value function.
