@@ -7,6 +7,7 @@ raises: it prints what is wrong, or OK.
 
 import platform
 import sys
+import textwrap
 from collections.abc import Callable
 from importlib.metadata import PackageNotFoundError, version
 
@@ -65,7 +66,8 @@ def check_setup() -> None:
     found = {name: _version(name) for name in PACKAGES}
     check_that("all packages are installed", [number is not None for number in found.values()])
     check_that("the simulator repeats an episode from its seed", _episode_repeats())
-    print("\nhere:", f"Python {platform.python_version()},", ", ".join(f"{k} {v}" for k, v in found.items()))
+    versions = ", ".join(f"{name} {number}" for name, number in found.items())
+    print(textwrap.fill(f"here: Python {platform.python_version()}, {versions}", 80))
 
 
 def _version(name: str) -> str | None:
