@@ -75,9 +75,9 @@ class Config:
     is closest to the rescaled budget; 'never': 'the closest value' is finite."""
     normalise_observations: bool = True
     """Give the networks observations of mean zero and variance one."""
-    unsafe_slope: float | None = None
-    """What an unsafe action is worth. None: zero, the paper's penalty; where all actions are unsafe it leaves
-    the policy to chance. A number: Q_r minus so many times the typical Q_r per cost range of excess."""
+    penalty_ramp: float = 0.0
+    """How much excess over the limit, in cost ranges, takes the value of an action to zero. 0: any, the paper's
+    indicator; where all actions are unsafe it leaves the policy to chance."""
     shift_rewards: bool = False
     """Train on rewards minus their dataset minimum. The zero penalty punishes only where Q_r > 0."""
 

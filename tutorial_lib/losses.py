@@ -24,16 +24,14 @@ def expectile_loss(target: Tensor, value: Tensor, kappa: float) -> Tensor:
     return (expectile_weight(advantage, kappa).detach() * advantage.square()).mean()
 
 
-def penalised_q(q_reward: Tensor, cost: Tensor, limit: Tensor, slope: float | None = None) -> Tensor:
+def penalised_q(q_reward: Tensor, cost: Tensor, limit: Tensor, ramp: float = 0.0) -> Tensor:
     """Eq. 11: Q_{r|c} = 1(cost <= limit) Q_r; all (B,). An infinite limit penalises nothing.
 
-    With a `slope`, an unsafe action is worth Q_r - slope (cost - limit) instead of the paper's zero: unsafe
-    actions are then ranked, by reward and by how far they miss, also where all actions are unsafe.
+    With a `ramp` the indicator does not drop to zero at the limit but falls to it over so much excess:
+    clip(1 - (cost - limit) / ramp, 0, 1). Actions are then ranked by their cost also where all are unsafe.
     """
-    safe = cost <= limit
-    if slope is None:
-        return torch.where(safe, q_reward, 0.0)
-    return q_reward - slope * torch.where(safe, 0.0, cost - limit)
+    excess = torch.where(cost <= limit, 0.0, cost - limit)
+    return torch.where(excess == 0, 1.0, (1 - excess / ramp).clamp(min=0.0) if ramp else 0.0) * q_reward
 
 
 def td_target(reward: Tensor, gamma: Tensor | float, next_value: Tensor, mask: Tensor) -> Tensor:

@@ -29,9 +29,8 @@ class IQL(Agent):
         v = net.value(s)
         value_loss = L.expectile_loss(q, v, self.config.kappa_1)  # eq. 6
 
-        target = L.td_target(
-            batch.rewards, self.config.gamma, net.value(s_next), 1 - batch.terminals
-        )  # eq. 7
+        mask = self.reward_mask(batch)
+        target = L.td_target(batch.rewards, self.config.gamma, net.value(s_next), mask)  # eq. 7
         critic_loss = L.td_loss(target, net.critics(s, a))
 
         weight = L.awr_weight(
