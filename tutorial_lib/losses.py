@@ -24,14 +24,17 @@ def expectile_loss(target: Tensor, value: Tensor, kappa: float) -> Tensor:
     return (expectile_weight(advantage, kappa).detach() * advantage.square()).mean()
 
 
-def penalised_q(q_reward: Tensor, cost: Tensor, limit: Tensor, ramp: float = 0.0) -> Tensor:
+def penalised_q(
+    q_reward: Tensor, cost: Tensor, limit: Tensor, unsafe_share: float = 0.0, price: float = 0.0
+) -> Tensor:
     """Eq. 11: Q_{r|c} = 1(cost <= limit) Q_r; all (B,). An infinite limit penalises nothing.
 
-    With a `ramp` the indicator does not drop to zero at the limit but falls to it over so much excess:
-    clip(1 - (cost - limit) / ramp, 0, 1). Actions are then ranked by their cost also where all are unsafe.
+    The paper's unsafe action is worth zero, whatever it earns and however much it costs. It may instead keep
+    a share of its Q_r and pay a price per unit of excess: then unsafe actions are ranked, also where all are.
     """
-    excess = torch.where(cost <= limit, 0.0, cost - limit)
-    return torch.where(excess == 0, 1.0, (1 - excess / ramp).clamp(min=0.0) if ramp else 0.0) * q_reward
+    safe = cost <= limit
+    excess = torch.where(safe, 0.0, cost - limit)
+    return torch.where(safe, q_reward, unsafe_share * q_reward - price * excess)
 
 
 def td_target(reward: Tensor, gamma: Tensor | float, next_value: Tensor, mask: Tensor) -> Tensor:

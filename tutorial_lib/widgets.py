@@ -15,7 +15,10 @@ SLIDER = {"continuous_update": False, "style": {"description_width": "initial"}}
 
 
 class Controls(ipywidgets.interactive):
-    """`ipywidgets.interactive`, with words for readers without a kernel."""
+    """`ipywidgets.interactive` that shows what its callback returns, with words for readers without a kernel."""
+
+    def __init__(self, callback, **sliders):
+        super().__init__(callback, {"auto_display": True}, **sliders)
 
     def __repr__(self):
         names = " and ".join(widget.description for widget in self.kwargs_widgets)

@@ -89,8 +89,8 @@ class C2IQL(Agent):
         q_cost = q_cost.take_along_dim(worst[None, :, None], 0).squeeze(0)  # (B, m)
 
         # Lines 9-10: constraint penalisation.
-        ramp = config.penalty_ramp * self.task.cost_range
-        q = L.penalised_q(net.target_critics(s, a).amin(0), cost, limit, ramp)
+        price = config.unsafe_price * self.modules["value"].scale / self.task.cost_range
+        q = L.penalised_q(net.target_critics(s, a).amin(0), cost, limit, config.unsafe_share, price)
 
         # Lines 11-12: value function.
         v = net.value(s)
