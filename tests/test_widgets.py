@@ -47,6 +47,14 @@ def test_moving_the_slider_draws_anew(agent, capsys):
     assert (limit.min, limit.max, start.value) == (0, 80, 3)
 
 
+def test_the_picture_is_displayed_and_not_only_made(agent, monkeypatch):
+    shown = []
+    monkeypatch.setattr("ipywidgets.widgets.interaction.display", shown.append)
+    control = widgets.limit_slider(agent, limit=40, seed=3)
+    control.kwargs_widgets[0].value = 60
+    assert [figure.axes[0].get_title().split(":")[0] for figure in shown] == ["limit 40", "limit 60"]
+
+
 def test_a_reader_without_a_kernel_is_told_what_is_missing(agent, capsys):
     assert repr(widgets.limit_slider(agent)) == "(Run the notebook for sliders: limit and start.)"
 

@@ -15,7 +15,7 @@ SLIDER = {"continuous_update": False, "style": {"description_width": "initial"}}
 
 
 class Controls(ipywidgets.interactive):
-    """`ipywidgets.interactive` that shows what its callback returns, with words for readers without a kernel."""
+    """`ipywidgets.interactive` that shows what its callback returns, and has words for who has no kernel."""
 
     def __init__(self, callback, **sliders):
         super().__init__(callback, {"auto_display": True}, **sliders)
