@@ -108,9 +108,9 @@ def test_penalised_q_by_hand():
     limit = torch.tensor([10.0, 10.0, 10.0, 10.0, 10.0, math.inf])
     # The limit itself is allowed. A negative Q of an unsafe action becomes zero, a reward: the paper's rule.
     assert L.penalised_q(q, cost, limit).tolist() == [5.0, 5.0, 0.0, -5.0, 0.0, 5.0]
-    # With a slope of 2 an unsafe action is worth minus twice its excess, whatever its Q.
-    assert L.penalised_q(q, cost, limit, 2.0).tolist() == pytest.approx(
-        [5.0, 5.0, -0.2, -5.0, -2.0, 5.0], rel=1e-5
+    # Keeping half its Q and paying 2 per unit of excess: 2.5 - 0.2 and -2.5 - 2.
+    assert L.penalised_q(q, cost, limit, 0.5, 2.0).tolist() == pytest.approx(
+        [5.0, 5.0, 2.3, -5.0, -4.5, 5.0], rel=1e-5
     )
 
 
