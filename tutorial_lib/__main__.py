@@ -1,4 +1,4 @@
-"""The command line: `c2iql tasks | collect | fetch | train | evaluate | bench`.
+"""The command line: `c2iql tasks | collect | fetch | train | evaluate | bench | report`.
 
 tyro turns functions and dataclasses into commands with help and types, so no option is written twice.
 """
@@ -160,6 +160,13 @@ def bench(task: str = "BallCircle", workers: int | None = None, rounds: int = 3,
     print(simulation_speeds.to_string(index=False, formatters=formats))
 
 
+def report() -> None:
+    """Make the tables of README.md and data/README.md, and the pictures of the datasets, from the files."""
+    from tutorial_lib import report as reporting
+
+    print("\n".join(f"wrote {path}" for path in reporting.write()))
+
+
 def with_options(config: Config, options: tuple[str, ...]) -> Config:
     """The config with `name=value` changes; values are read as the field's own type. Raises ValueError."""
     fields = {field.name: field for field in dataclasses.fields(Config)}
@@ -174,7 +181,7 @@ def with_options(config: Config, options: tuple[str, ...]) -> Config:
 
 def main() -> None:
     """Entry point: errors that a user can mend are one line, without a traceback."""
-    commands = {f.__name__: f for f in (tasks, collect, fetch, train, evaluate, bench)}
+    commands = {f.__name__: f for f in (tasks, collect, fetch, train, evaluate, bench, report)}
     try:
         tyro.extras.subcommand_cli_from_dict(
             commands, prog="c2iql", description="Safe offline RL with C2IQL."

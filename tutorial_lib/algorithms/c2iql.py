@@ -72,9 +72,8 @@ class C2IQL(Agent):
             q_cost = q_cost * (1 - gammas**horizon)
         if self.reconstructs:
             return self.reconstruction(q_cost)
-        return (q_cost / ((1 - gammas**horizon) / (1 - gammas) / horizon)).squeeze(
-            -1
-        )  # Q <= L~, times L / L~
+        share = (1 - gammas**horizon) / (1 - gammas) / horizon  # L~ / L, eq. 2
+        return (q_cost / share).squeeze(-1)
 
     def losses(self, net, batch, limit):
         config, a = self.config, batch.actions
