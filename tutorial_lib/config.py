@@ -51,8 +51,8 @@ class Config:
     """Standard deviation of the noise on the reconstruction model's inputs, in discounted cost."""
     crm_noise_rate: float = 0.0
     """More of it, in cost per step: head i gets this over 1 - gamma_i. The model should expect the error that
-    the critics make; theirs is about 0.01 after some thousand updates, ten times what Table 4's 0.1 allows for,
-    and the model's alternating weights multiply it."""
+    the critics make: theirs is about 0.01 after some thousand updates, ten times what 0.1 allows for, and the
+    model's alternating weights multiply it."""
 
     # Paper silent: we ...
     time_limits: Literal["rate", "bootstrap", "mask"] = "rate"
@@ -60,8 +60,8 @@ class Config:
     1 - gamma_i^T before the reconstruction; 'bootstrap' leaves out the factor; 'mask' stops there, so that
     the estimate is the remaining cost and is compared with the unscaled remaining budget."""
     reward_time_limits: Literal["bootstrap", "mask"] = "mask"
-    """What a time limit means to V_r and Q_r. 'bootstrap' is IQL's code, 'mask' is OSRL's. The states at time
-    limits are never trained on, and in the Run tasks nothing like them is: bootstrapping there extrapolates."""
+    """What a time limit means to V_r and Q_r. 'bootstrap' is IQL's code, 'mask' is OSRL's. States at time
+    limits are never trained on, and in the Run tasks nothing like them is: bootstrapping extrapolates."""
     cost_kappa: float | None = None
     """Expectile whose implicit policy the cost critics evaluate; None: kappa_1, as Algorithm 2. The policy
     that runs is extracted with kappa_2, so kappa_2 here evaluates (nearly) the policy that runs."""
@@ -71,15 +71,15 @@ class Config:
     """One threshold per transition (lower variance), or one per batch as Algorithm 2's line 5 reads."""
     infinite_at_test: Literal["covered", "nearest", "never"] = "covered"
     """When the budget rule gives the policy the infinite threshold. 'covered': once the budget left covers
-    every step left, since costs are 0 or 1 and no behaviour can then break the limit; 'nearest': where its code
-    is closest to the rescaled budget; 'never': 'the closest value' is finite."""
+    every step left, since costs are 0 or 1 and nothing can then break the limit; 'nearest': where its code is
+    closest to the rescaled budget; 'never': 'the closest value' is finite."""
     normalise_observations: bool = True
     """Give the networks observations of mean zero and variance one."""
     unsafe_share: float = 0.0
     """Share of its Q_r that an unsafe action keeps. The paper's penalty keeps none."""
     unsafe_price: float = 0.0
-    """What it pays for its excess over the limit: so many times the typical Q_r per cost range. At the paper's
-    zero, the policy is left to chance wherever all actions are unsafe."""
+    """What it pays for its excess over the limit: so many times the typical Q_r per cost range. At zero,
+    the paper's, the policy is left to chance wherever all actions are unsafe."""
     shift_rewards: bool = False
     """Train on rewards minus their dataset minimum. The zero penalty punishes only where Q_r > 0."""
 

@@ -16,7 +16,6 @@ from tutorial_lib.discounting import discounted_sums, random_cost_sequences
 from tutorial_lib.networks import mlp
 from tutorial_lib.tasks import Task
 
-
 POOL = 60_000
 """Random sequences, drawn once: generating new ones for every batch costs more than learning from them."""
 

@@ -49,6 +49,7 @@ def datasheet() -> str:
     for name in shipped_tasks():
         path, data = SHIPPED_DATA / f"{name}.hdf5", load_dataset(name)
         costs, returns = data.episode_costs, data.episode_returns
+        minutes = int(data.attributes["wall_seconds"]) // 60
         rows.append(
             {
                 "file": f"`{path.name}`",
@@ -57,7 +58,7 @@ def datasheet() -> str:
                 "transitions": f"{len(data):,}",
                 "cost": f"{costs.min():.0f} to {costs.max():.0f}, mean {costs.mean():.0f}",
                 "return": f"{returns.min():.0f} to {returns.max():.0f}",
-                "made with": f"`{data.attributes['made_by']}`, {int(data.attributes['wall_seconds']) // 60} min",
+                "made with": f"`{data.attributes['made_by']}`, {minutes} min",
                 "SHA-256": f"`{hashlib.sha256(path.read_bytes()).hexdigest()}`",
             }
         )
@@ -83,9 +84,10 @@ def results_table(path: Path = FIRST_LIGHT) -> str:
     for task, part in results.groupby("task", sort=False):
         scores, row = with_scores(part), {"task": task}
         for _, line in summarise(part).iterrows():
-            row[f"{get_task(task).cost_limit_names[line['threshold']]} limit: reward / cost"] = (
-                f"{line['reward_score']:.2f} [{line['reward_score_low']:.2f}, {line['reward_score_high']:.2f}] / "
-                f"{line['cost_score']:.2f} [{line['cost_score_low']:.2f}, {line['cost_score_high']:.2f}]"
+            limit = get_task(task).cost_limit_names[line["threshold"]]
+            row[f"{limit} limit: reward / cost"] = " / ".join(
+                f"{line[name]:.2f} [{line[f'{name}_low']:.2f}, {line[f'{name}_high']:.2f}]"
+                for name in ("reward_score", "cost_score")
             )
         row["mean: reward / cost"] = (
             f"{scores['reward_score'].mean():.2f} / {scores['cost_score'].mean():.2f}"

@@ -4,6 +4,7 @@ import csv
 import json
 import os
 import time
+import warnings
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
@@ -76,7 +77,18 @@ def train(
             if on_checkpoint:
                 on_checkpoint(agent)
     bar.close()
+    _warn_of_negative_q(agent, log)
     return log
+
+
+def _warn_of_negative_q(agent: Agent, log: list[dict]) -> None:
+    share = max((row.get("negative_q", 0.0) for row in log[-len(agent.seeds) :]), default=0.0)
+    if share > 0.01 and agent.config.unsafe_share == 0 and not agent.config.shift_rewards:
+        warnings.warn(
+            f"{share:.0%} of Q_r are negative: the zero penalty rewards unsafe actions there; "
+            "try shift_rewards=True, or unsafe_share and unsafe_price",
+            stacklevel=3,
+        )
 
 
 def _training_data(dataset: Dataset, agent: Agent) -> Batch:
@@ -104,7 +116,7 @@ def _check_finite(rows: list[dict]) -> None:
             if value - value != 0:  # NaN and both infinities
                 raise TrainingError(
                     f"{name} is {value} at update {row['update']} of seed {row['seed']}: "
-                    "the last checkpoint is kept; try a smaller learning rate, and look at the data for outliers"
+                    "the last checkpoint is kept; try a smaller learning rate, look for outliers in the data"
                 )
 
 

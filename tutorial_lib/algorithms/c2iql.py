@@ -89,7 +89,8 @@ class C2IQL(Agent):
 
         # Lines 9-10: constraint penalisation.
         price = config.unsafe_price * self.modules["value"].scale / self.task.cost_range
-        q = L.penalised_q(net.target_critics(s, a).amin(0), cost, limit, config.unsafe_share, price)
+        q_reward = net.target_critics(s, a).amin(0)
+        q = L.penalised_q(q_reward, cost, limit, config.unsafe_share, price)
 
         # Lines 11-12: value function.
         v = net.value(s)
@@ -125,7 +126,7 @@ class C2IQL(Agent):
             "safe_fraction": (cost <= limit).float().mean(),
             "cost_mean": cost.mean(),
             "value_mean": v.mean(),
-            "negative_q": (q < 0).float().mean(),
+            "negative_q": (q_reward < 0).float().mean(),
         }
 
     def predicted_cost(self, observations, limit, run=0):

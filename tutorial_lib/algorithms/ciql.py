@@ -31,7 +31,8 @@ class CIQL(Agent):
         average_limit = average_threshold(limit, config.gamma, self.task.horizon)
 
         q_cost = net.target_cost_critics(s, a).amax(0)  # (B, 1)
-        q = L.penalised_q(net.target_critics(s, a).amin(0), q_cost[:, 0], average_limit)  # eq. 11
+        q_reward = net.target_critics(s, a).amin(0)
+        q = L.penalised_q(q_reward, q_cost[:, 0], average_limit)  # eq. 11
         v = net.value(s)
         value_loss = L.expectile_loss(q, v, config.kappa_1)  # eq. 12
 
@@ -58,4 +59,5 @@ class CIQL(Agent):
         return losses, {
             "safe_fraction": (q_cost[:, 0] <= average_limit).float().mean(),
             "value_mean": v.mean(),
+            "negative_q": (q_reward < 0).float().mean(),
         }

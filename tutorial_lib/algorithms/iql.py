@@ -39,4 +39,4 @@ class IQL(Agent):
         policy_loss = L.policy_loss(weight, gaussian_log_prob(a, *net.policy(s)))  # eq. 8
 
         losses = {"value": value_loss, "critic": critic_loss, "policy": policy_loss}
-        return losses, {"value_mean": v.mean(), "negative_q": (q < 0).float().mean()}
+        return losses, {"value_mean": v.mean()}
