@@ -1,0 +1,267 @@
+"""Rollouts against loops by hand in the real simulator; scores and intervals against arithmetic."""
+
+import dataclasses
+import math
+import pickle
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+
+from tutorial_lib.algorithms import get_algorithm
+from tutorial_lib.config import Config
+from tutorial_lib.envs import make_env
+from tutorial_lib.evaluation import (
+    EPISODES_TOGETHER,
+    evaluate,
+    normalised_cost,
+    normalised_return,
+    rollout,
+    save_results,
+    summarise,
+    with_scores,
+)
+from tutorial_lib.tasks import TASKS
+
+CONFIG = Config(profile="test", hidden_width=16, hidden_layers=1, crm_width=8, crm_layers=1)
+COLUMNS = "task algorithm profile seed threshold episode return cost length".split()
+
+
+def make_agent(name="C2IQL", task="BallRun", seeds=(0,), threshold=None, **changes):
+    """An agent that nobody has trained, with weights so large that it moves, and heeds its limit."""
+    config = dataclasses.replace(CONFIG, **changes)
+    agent = get_algorithm(name)(TASKS[task], config, seeds=seeds, threshold=threshold)
+    generator = torch.Generator().manual_seed(3)
+    for value in agent.parameters["policy"].values():
+        value.data = 1.5 * torch.randn(value.shape, generator=generator)
+    return agent
+
+
+def same(rollout, other):
+    return all(np.array_equal(x, y, equal_nan=True) for x, y in zip(rollout, other, strict=True))
+
+
+# --- Episodes ---
+
+
+def test_the_same_seeds_give_the_same_episodes_whatever_ran_before():
+    agent, seeds = make_agent(), [7, 8, 9]
+    first = rollout(agent, [30, 50, 70], seeds)
+    rollout(agent, 10, [100, 101, 102])
+    rollout(make_agent("IQL"), 10, seeds)
+    assert same(rollout(agent, [30, 50, 70], seeds), first)
+    assert not same(rollout(agent, [30, 50, 70], [7, 8, 10]), first)
+
+
+def test_more_workers_give_the_same_rows():
+    agent = make_agent(seeds=(0, 4))
+    alone = evaluate(agent, (60.5,), episodes=EPISODES_TOGETHER + 2, workers=1)
+    beside = evaluate(agent, (60.5,), episodes=EPISODES_TOGETHER + 2, workers=2)
+    pd.testing.assert_frame_equal(alone, beside, check_exact=True)
+    assert len(alone) == alone["return"].nunique() == 2 * 12  # no two of them are the same episode
+
+
+def budget_rule(limit, spent, t, task, config):
+    """Eq. 23 and the closest value, for one episode, in plain numbers."""
+    left, steps_left = limit - spent, task.horizon - t
+    budget = left if config.time_limits == "mask" else left * task.horizon / steps_left
+    if config.infinite_at_test == "covered" and left >= steps_left:
+        return math.inf
+    places = {float(threshold): threshold for threshold in task.thresholds}
+    if config.infinite_at_test == "nearest":
+        places[math.inf] = 1.5 * task.cost_range
+    if budget == math.inf:
+        return max(places)
+    return min(places, key=lambda threshold: abs(places[threshold] - budget))
+
+
+@pytest.mark.parametrize("infinite", ["covered", "nearest", "never"])
+@pytest.mark.parametrize("time_limits", ["rate", "mask"])
+def test_every_step_is_that_of_a_loop_by_hand_under_the_budget_rule(time_limits, infinite):
+    agent = make_agent(seeds=(0, 1), time_limits=time_limits, infinite_at_test=infinite)
+    limits, seeds, run = [0.0, 30.0, 35.5, 50.0, 100.0, math.inf], [11, 12, 13, 14, 15, 16], 1
+    played = rollout(agent, limits, seeds, run)
+    envs = [make_env("BallRun") for _ in seeds]
+    observations = [env.reset(seed=seed)[0] for env, seed in zip(envs, seeds, strict=True)]
+    spent = [0.0] * 6
+    for t in range(100):
+        given = [budget_rule(limits[e], spent[e], t, agent.task, agent.config) for e in range(6)]
+        assert played.conditions[t].tolist() == given
+        if t == 0:
+            expected = agent.predicted_cost(np.stack(observations), np.array(given), run)
+            np.testing.assert_array_equal(played.predicted_costs, expected)
+        actions = agent.act(np.stack(observations), np.array(given), run)
+        for e, env in enumerate(envs):
+            observations[e], reward, _, _, info = env.step(actions[e])
+            spent[e] += info["cost"]
+            assert (played.rewards[t, e], played.costs[t, e]) == (reward, info["cost"])
+            assert played.positions[t, e].tolist() == list(env.position)
+    assert played.lengths.tolist() == [100] * 6
+    assert 20 < max(spent) and len(np.unique(played.conditions)) > 2  # or little was shown
+
+
+def test_an_agent_without_conditions_is_given_none_and_keeps_its_own_threshold():
+    agent = make_agent("CIQL", threshold=30.0)
+    played = rollout(agent, 30, [1, 2])
+    assert np.isnan(played.conditions).all() and np.isnan(played.predicted_costs).all()
+    assert set(evaluate(agent, (50, 70), episodes=2)["threshold"]) == {30.0}
+    assert np.isfinite(rollout(make_agent("C2IQL w/o CC", threshold=30.0), 30, [1]).predicted_costs).all()
+
+
+def test_an_episode_that_ends_early_leaves_zeros():
+    agent, seeds = make_agent(task="DroneRun"), range(4)
+    played = rollout(agent, 30, seeds)
+    envs = [make_env("DroneRun") for _ in seeds]
+    observations = np.stack([env.reset(seed=seed)[0] for env, seed in zip(envs, seeds, strict=True)])
+    lengths = [None] * len(seeds)
+    for t in range(200):
+        chosen = agent.act(observations, played.conditions[t])
+        for e, env in enumerate(envs):
+            if lengths[e] is None:
+                observations[e], reward, terminated, truncated, _ = env.step(chosen[e])
+                assert played.rewards[t, e] == reward
+                lengths[e] = t + 1 if terminated or truncated else None
+    assert played.lengths.tolist() == lengths
+    assert min(lengths) < 100 and len(set(lengths)) > 2  # some fall, at different times
+    for e, length in enumerate(lengths):
+        for values in (played.rewards, played.costs, played.positions):
+            assert not values[length:, e].any()
+        assert played.rewards[:length, e].all()
+
+
+def test_results_are_the_sums_of_the_rollouts():
+    agent = make_agent(seeds=(0, 2), task="BallRun")
+    results = evaluate(agent, episodes=3)
+    assert set(COLUMNS) <= set(results.columns)
+    keys = results[["seed", "threshold", "episode"]].itertuples(index=False, name=None)
+    assert list(keys) == [(s, limit, e) for s in (0, 2) for limit in (30, 50, 70) for e in range(3)]
+    assert set(zip(results["task"], results["algorithm"], results["profile"], strict=True)) == {
+        ("BallRun", "C2IQL", "test")
+    }
+    for run, seed in enumerate((0, 2)):
+        for limit in (30, 50, 70):
+            part = results[(results["seed"] == seed) & (results["threshold"] == limit)]
+            played = rollout(agent, limit, [1000 * (seed + 1) + episode for episode in range(3)], run)
+            assert part["return"].tolist() == played.rewards.sum(0).tolist()
+            assert part["cost"].tolist() == played.costs.sum(0).tolist()
+            assert part["length"].tolist() == played.lengths.tolist()
+            assert part["predicted_cost"].tolist() == played.predicted_costs.tolist()
+
+
+@pytest.mark.parametrize("bad", [-1, -0.001, math.nan])
+def test_a_threshold_that_is_none_is_refused(bad):
+    with pytest.raises(ValueError, match="threshold must be zero or more"):
+        rollout(make_agent(), [30, bad], [0, 1])
+    with pytest.raises(ValueError, match="threshold must be zero or more"):
+        evaluate(make_agent(), (30, bad), episodes=1)
+
+
+# --- Scores ---
+
+
+def test_scores_by_hand():
+    ball = TASKS["BallRun"]  # its returns go from 26.3398 to 1327.4456
+    assert normalised_return([26.3398, 1327.4456, 676.8927], ball) == pytest.approx([0, 1, 0.5])
+    assert normalised_cost([0, 15, 30, 45], 30) == pytest.approx([0, 0.5, 1, 1.5])
+    assert normalised_cost([0, 3], 0) == pytest.approx([1, 4])  # (C + 1) / (0 + 1): nothing kept but zero
+    assert normalised_cost([5, 5, 5], [0, 10, math.inf]) == pytest.approx([6, 0.5, 0])
+
+
+def results_of(returns, costs=None, **columns):
+    columns = {"task": "BallRun", "algorithm": "A", "profile": "p", "seed": 0, "threshold": 30.0} | columns
+    frame = pd.DataFrame({"return": returns, "cost": 15.0 if costs is None else costs} | columns)
+    return frame.assign(episode=range(len(frame)), length=100)
+
+
+def test_every_task_has_its_own_scale():
+    both = pd.concat([results_of([26.3398]), results_of([204.2873, 574.6533], task="CarRun", threshold=10.0)])
+    scored = with_scores(both).set_index("task")
+    assert scored.loc["BallRun", "reward_score"] == pytest.approx(0)
+    assert scored.loc["CarRun", "reward_score"].tolist() == pytest.approx([0, 1])
+    assert scored["cost_score"].tolist() == pytest.approx([0.5, 1.5, 1.5])
+
+
+def test_a_summary_has_a_row_for_each_threshold_with_means_and_counts():
+    span = 1327.4456 - 26.3398
+    parts = [
+        results_of([26.3398, 26.3398 + span], costs=[0.0, 30.0], threshold=30.0),
+        results_of([26.3398 + span / 2] * 3, costs=[35.0] * 3, threshold=70.0, seed=[0, 1, 2]),
+    ]
+    summary = summarise(pd.concat(parts))
+    assert summary["threshold"].tolist() == [30, 70]
+    assert summary["seeds"].tolist() == [1, 3] and summary["episodes"].tolist() == [2, 3]
+    assert summary["reward_score"].tolist() == pytest.approx([0.5, 0.5])
+    assert summary["cost_score"].tolist() == pytest.approx([0.5, 0.5])
+    first, second = summary.to_dict("records")
+    assert (first["cost_score_low"], first["cost_score_high"]) == pytest.approx(
+        (0, 1)
+    )  # 0, 0.5 or 1: all likely
+    assert second["cost_score_low"] == second["cost_score_high"] == pytest.approx(0.5)  # nothing varies
+
+
+def interval(costs):
+    row = summarise(results_of([0.0] * len(costs), costs=costs)).iloc[0]
+    return 30 * row["cost_score_low"], 30 * row["cost_score_high"]
+
+
+def test_the_interval_is_the_bootstraps():
+    rng = np.random.default_rng(0)
+    for costs in (rng.exponential(20, size=30), rng.integers(0, 50, size=9).astype(float)):
+        means = sorted(costs[rng.integers(len(costs), size=len(costs))].mean() for _ in range(20_000))
+        low, high = means[500], means[-501]
+        assert interval(costs) == pytest.approx((low, high), abs=0.05 * (high - low))
+
+
+def test_the_interval_narrows_with_more_episodes_and_widens_with_their_spread():
+    costs = np.random.default_rng(1).exponential(20, size=30)
+    low, high = interval(costs)
+    wide = interval(costs.mean() + 2 * (costs - costs.mean()))
+    narrow = interval(np.tile(costs, 4))
+    assert wide[1] - wide[0] == pytest.approx(2 * (high - low), rel=0.05)
+    assert narrow[1] - narrow[0] == pytest.approx((high - low) / 2, rel=0.05)
+    assert interval(costs) == (low, high)  # it is the same every time
+
+
+def test_the_interval_covers_the_truth_nineteen_times_in_twenty():
+    rng, covered = np.random.default_rng(2), 0
+    for _ in range(120):
+        low, high = interval(rng.normal(20, 5, size=30))
+        covered += low <= 20 <= high
+    assert 0.87 < covered / 120 < 0.99
+
+
+# --- Files ---
+
+
+def test_saved_results_are_read_back(tmp_path):
+    results = evaluate(make_agent(), episodes=2)
+    path = tmp_path / "deep" / "results.csv"
+    save_results(results, path)
+    read = pd.read_csv(path)
+    assert read.columns.tolist() == results.columns.tolist()
+    pd.testing.assert_frame_equal(read, results, check_dtype=False, rtol=1e-5)
+    assert [p.name for p in path.parent.iterdir()] == ["results.csv"]
+
+
+def test_a_write_that_breaks_off_leaves_the_old_results(tmp_path):
+    path = tmp_path / "results.csv"
+    path.write_text("old")
+
+    class Broken(pd.DataFrame):
+        def to_csv(self, target, **options):
+            with open(target, "w") as file:
+                file.write("task,algo")
+            raise OSError("No space left on device")
+
+    with pytest.raises(OSError, match="space"):
+        save_results(Broken(), path)
+    assert path.read_text() == "old"
+
+
+def test_a_worker_is_sent_no_optimiser():
+    """The moments are twice the networks' size, and are of no use to play."""
+    agent = make_agent(seeds=(0, 1))
+    sent = pickle.loads(pickle.dumps(agent))
+    assert "optimiser" in vars(agent) and "optimiser" not in vars(sent)
+    assert same(rollout(sent, 30, [1, 2], run=1), rollout(agent, 30, [1, 2], run=1))
