@@ -122,6 +122,9 @@ def run_ppo(task: Task, recipe: Recipe, seed: int, folder: Path, slice_steps: in
     model = _make_ppo(task, recipe, seed + 1000 * done, episodes, clock)
     if done:
         _load_ppo(model, folder / "state.safetensors")
+        # Killed between its two files, a slice has left its state but no episodes: it is played again.
+        batch = model.n_steps * model.n_envs
+        model.num_timesteps = -(-done * slice_steps // batch) * batch
     bar = tqdm(
         total=slices * slice_steps, initial=done * slice_steps, desc=f"{task.name} seed {seed}", unit="step"
     )
