@@ -7,6 +7,7 @@ from pathlib import Path
 import nbformat
 import numpy as np
 import pytest
+import torch
 
 from tutorial_lib import checks
 from tutorial_lib.tasks import get_task
@@ -56,7 +57,8 @@ def test_check_at_most(capsys):
 
 def test_check_that(capsys):
     checks.check_that("it holds", [True, True])
-    assert capsys.readouterr().out == "OK  it holds\n"
+    checks.check_that("it holds", torch.tensor(True))
+    assert capsys.readouterr().out == "OK  it holds\n" * 2
     with pytest.raises(AssertionError, match="1 of 3 cases"):
         checks.check_that("it holds", np.array([True, False, True]))
     with pytest.raises(AssertionError, match="FAILED  it holds: it does not$"):

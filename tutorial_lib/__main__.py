@@ -4,9 +4,10 @@ tyro turns functions and dataclasses into commands with help and types, so no op
 """
 
 import dataclasses
+import inspect
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import pandas as pd
 import torch
@@ -19,6 +20,7 @@ from tutorial_lib.datasets import fetch_dataset, load_dataset
 from tutorial_lib.tasks import TASKS, get_task
 
 Positional = tyro.conf.Positional
+Device = Literal["cpu", "cuda"]
 
 
 def tasks() -> None:
@@ -79,7 +81,7 @@ def train(
     threshold: float | None = None,
     data: str = "shipped",
     out: Path | None = None,
-    device: str = "cpu",
+    device: Device = "cpu",
     option: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE")] = (),
 ) -> None:
     """Train an agent (several seeds together) and save it with its log; resumes a killed run.
@@ -102,7 +104,7 @@ def train(
         out
         or Path("runs") / record.name / f"{algorithm.replace(' ', '-').replace('/', '')}{suffix}-{profile}"
     )
-    agent = kind(record, config, seeds=seeds, threshold=threshold, device=device)
+    agent = kind(record, config, seeds=seeds, threshold=threshold, device=check_device(device))
     training.train(agent, load_dataset(record, data), run_dir=out)
     training.save_agent(agent, out / "agent.safetensors")
     print(
@@ -134,7 +136,7 @@ def evaluate(
     print(f"{out}: {len(results)} episodes")
 
 
-def bench(task: str = "BallCircle", workers: int | None = None, rounds: int = 3, device: str = "cpu") -> None:
+def bench(task: str = "BallCircle", workers: int | None = None, rounds: int = 3, device: Device = "cpu") -> None:
     """Measure this machine, in about a minute: how fast agents train, and how fast simulators step.
 
     The table of training has updates per second, the hours that all the profile's updates take, and the share
@@ -150,7 +152,9 @@ def bench(task: str = "BallCircle", workers: int | None = None, rounds: int = 3,
     from tutorial_lib import bench as benchmarks
 
     record = get_task(task)
-    training_speeds, simulation_speeds = benchmarks.bench(record, workers, rounds, device=device)
+    training_speeds, simulation_speeds = benchmarks.bench(
+        record, workers, rounds, device=check_device(device)
+    )
     print(f"C2IQL on {record.name}, {device}, {torch.get_num_threads()} thread(s): shares of an update")
     shares = dict.fromkeys(benchmarks.PARTS, "{:.0%}".format)
     others = {"updates_per_second": "{:.1f}".format, "hours": "{:.2f}".format}
@@ -169,14 +173,25 @@ def report() -> None:
 
 def with_options(config: Config, options: tuple[str, ...]) -> Config:
     """The config with `name=value` changes; values are read as the field's own type. Raises ValueError."""
-    fields = {field.name: field for field in dataclasses.fields(Config)}
-    arguments = []
+    types = {field.name: field.type for field in dataclasses.fields(Config)}
+    how = {"config": (tyro.conf.FlagConversionOff,), "console_outputs": False}  # shift_rewards=True is NAME=VALUE
     for option in options:
-        name, equals, value = option.partition("=")
-        if not equals or name not in fields:
-            raise ValueError(f"--option {option}: write NAME=VALUE with one of {', '.join(fields)}")
-        arguments += [f"--{name}", value]
-    return tyro.cli(Config, default=config, args=arguments)
+        name, equals, _ = option.partition("=")
+        if not equals or name not in types:
+            raise ValueError(f"--option {option}: write NAME=VALUE with one of {', '.join(types)}")
+        try:
+            config = tyro.cli(Config, default=config, args=[f"--{option}"], **how)
+        except SystemExit:
+            expected = inspect.formatannotation(types[name])
+            raise ValueError(f"--option {option}: the value must be of type {expected}") from None
+    return config
+
+
+def check_device(device: Device) -> Device:
+    """The device itself, or ValueError where this machine has none."""
+    if device == "cuda" and not torch.cuda.is_available():
+        raise ValueError("--device cuda: PyTorch finds no CUDA device here: leave it out to train on the CPU")
+    return device
 
 
 def main() -> None:
@@ -186,7 +201,7 @@ def main() -> None:
         tyro.extras.subcommand_cli_from_dict(
             commands, prog="c2iql", description="Safe offline RL with C2IQL."
         )
-    except (ValueError, training.TrainingError) as error:
+    except (ValueError, OSError, training.TrainingError) as error:
         sys.exit(f"c2iql: {error}")
 
 

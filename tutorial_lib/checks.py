@@ -40,8 +40,9 @@ def check_at_most(name: str, value: float, bound: float) -> None:
 
 def check_that(claim: str, holds) -> None:
     """Does the claim hold? For an array: everywhere."""
-    if not np.all(holds):
-        where = "" if np.ndim(holds) == 0 else f" in {np.sum(~np.asarray(holds))} of {np.size(holds)} cases"
+    holds = np.asarray(holds)
+    if not holds.all():
+        where = f" in {np.sum(~holds)} of {holds.size} cases" if holds.ndim else ""
         raise AssertionError(f"FAILED  {claim}: it does not{where}")
     print(f"OK  {claim}")
 

@@ -30,7 +30,7 @@ def play(agent, limit: float, seed: int):
     return plotting.episode(rollout(agent, [limit], [seed]), agent.task, limit)
 
 
-def limit_slider(agent, limit: float = 40, seed: int = 7) -> Controls:
+def limit_slider(agent, limit: float = 40, seed: int = 10) -> Controls:
     """`play` with a slider for the limit, up to the task's cost range, and one for the start."""
     limits = ipywidgets.IntSlider(limit, 0, int(agent.task.cost_range), 5, description="limit", **SLIDER)
     starts = ipywidgets.IntSlider(seed, 0, 20, 1, description="start", **SLIDER)
