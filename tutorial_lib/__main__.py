@@ -3,8 +3,10 @@
 tyro turns functions and dataclasses into commands with help and types, so no option is written twice.
 """
 
+import contextlib
 import dataclasses
 import inspect
+import io
 import sys
 from pathlib import Path
 from typing import Annotated, Literal
@@ -136,7 +138,9 @@ def evaluate(
     print(f"{out}: {len(results)} episodes")
 
 
-def bench(task: str = "BallCircle", workers: int | None = None, rounds: int = 3, device: Device = "cpu") -> None:
+def bench(
+    task: str = "BallCircle", workers: int | None = None, rounds: int = 3, device: Device = "cpu"
+) -> None:
     """Measure this machine, in about a minute: how fast agents train, and how fast simulators step.
 
     The table of training has updates per second, the hours that all the profile's updates take, and the share
@@ -151,10 +155,8 @@ def bench(task: str = "BallCircle", workers: int | None = None, rounds: int = 3,
     """
     from tutorial_lib import bench as benchmarks
 
-    record = get_task(task)
-    training_speeds, simulation_speeds = benchmarks.bench(
-        record, workers, rounds, device=check_device(device)
-    )
+    record, device = get_task(task), check_device(device)
+    training_speeds, simulation_speeds = benchmarks.bench(record, workers, rounds, device=device)
     print(f"C2IQL on {record.name}, {device}, {torch.get_num_threads()} thread(s): shares of an update")
     shares = dict.fromkeys(benchmarks.PARTS, "{:.0%}".format)
     others = {"updates_per_second": "{:.1f}".format, "hours": "{:.2f}".format}
@@ -174,16 +176,17 @@ def report() -> None:
 def with_options(config: Config, options: tuple[str, ...]) -> Config:
     """The config with `name=value` changes; values are read as the field's own type. Raises ValueError."""
     types = {field.name: field.type for field in dataclasses.fields(Config)}
-    how = {"config": (tyro.conf.FlagConversionOff,), "console_outputs": False}  # shift_rewards=True is NAME=VALUE
     for option in options:
         name, equals, _ = option.partition("=")
         if not equals or name not in types:
             raise ValueError(f"--option {option}: write NAME=VALUE with one of {', '.join(types)}")
+        values = (tyro.conf.FlagConversionOff,)  # shift_rewards=True, not --shift-rewards
         try:
-            config = tyro.cli(Config, default=config, args=[f"--{option}"], **how)
+            with contextlib.redirect_stderr(io.StringIO()):  # tyro's message is for another command line
+                config = tyro.cli(Config, default=config, args=[f"--{option}"], config=values)
         except SystemExit:
-            expected = inspect.formatannotation(types[name])
-            raise ValueError(f"--option {option}: the value must be of type {expected}") from None
+            kind = "True or False" if types[name] is bool else inspect.formatannotation(types[name])
+            raise ValueError(f"--option {option}: the value must be {kind}") from None
     return config
 
 

@@ -6,10 +6,8 @@ the median of the ratios of measurements that stand side by side. Numbers depend
 
 import functools
 import time
-import warnings
 from collections.abc import Callable
 
-import gymnasium
 import joblib
 import numpy as np
 import pandas as pd
@@ -135,8 +133,8 @@ def simulation(
 ) -> pd.DataFrame:
     """One row per way to step: processes, steps per second, and the share of bare simulator x processes.
 
-    The bare simulator is gymnasium.make's without its wrappers, in one process. It and our environment
-    play the same actions, those of the rollouts' policy, in whole episodes with their resets.
+    Bare simulator and our environment play the same actions, those of the rollouts' policy, in whole episodes
+    with their resets.
     """
     agent = get_algorithm("C2IQL")(task, get_profile("small"))
     actions = _actions(agent)
@@ -190,12 +188,9 @@ def _play_beside(kind: str, task_name: str, actions: np.ndarray, workers: int) -
 
 @functools.lru_cache
 def _environment(kind: str, task_name: str):
-    ours = make_env(task_name)  # also registers the simulator, quietly
-    if kind == "ours":
-        return ours
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        return gymnasium.make(ours.task.env_id, disable_env_checker=True).unwrapped
+    """Each process keeps its own. The bare simulator is what gymnasium.make gives, without its wrappers."""
+    env = make_env(task_name)
+    return env if kind == "ours" else env._sim
 
 
 def _rollouts(agent, workers: int) -> int:

@@ -1,0 +1,233 @@
+"""The command line as a student types it: help, one-line errors, a tiny run from training to scores."""
+
+import dataclasses
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from tutorial_lib import __main__ as cli
+from tutorial_lib import bench
+from tutorial_lib.datasets import Dataset, write_dataset
+from tutorial_lib.tasks import TASKS
+from tutorial_lib.training import load_agent
+
+ROOT = Path(__file__).parents[1]
+TINY = ["hidden_width=8", "hidden_layers=1", "batch_size=8", "crm_width=8", "crm_layers=1", "crm_steps=5"]
+
+
+@pytest.fixture
+def c2iql(monkeypatch, capsys):
+    """Type a command; returns its exit status, what it printed, and what it said went wrong."""
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["c2iql", *map(str, arguments)])
+        status = 0
+        try:
+            cli.main()
+        except SystemExit as error:
+            status = error.code
+        out, err = capsys.readouterr()
+        if isinstance(status, str):  # what Python itself does with it
+            status, err = 1, err + status + "\n"
+        return status, out, err
+
+    return run
+
+
+@pytest.fixture
+def data(tmp_path):
+    """Three random episodes with BallRun's shapes, in a file."""
+    rng = np.random.default_rng(0)
+    dataset = Dataset(
+        observations=rng.normal(size=(300, 7)).astype(np.float32),
+        next_observations=rng.normal(size=(300, 7)).astype(np.float32),
+        actions=rng.uniform(-1, 1, size=(300, 2)).astype(np.float32),
+        rewards=rng.normal(5, 5, size=300).astype(np.float32),
+        costs=(rng.random(300) < 0.4).astype(np.float32),
+        terminals=np.zeros(300, bool),
+        timeouts=np.arange(1, 301) % 100 == 0,
+    )
+    return write_dataset(tmp_path / "data.hdf5", dataset, "BallRun")
+
+
+# --- Help ---
+
+
+def words(text):
+    """Without tyro's boxes and line breaks."""
+    return " ".join(re.sub("[─│╭╮╰╯]", " ", text).split())
+
+
+@pytest.mark.parametrize(
+    ("command", "phrases"),
+    {
+        "tasks": ["List the tasks"],
+        "collect": ["Make a dataset from the simulator", "--seeds", "one PPO run each"],
+        "fetch": ["Download DSRL's dataset", "DSRL_DATASET_DIR"],
+        "train": ["Train an agent", "--threshold", "kappa_2=0.7", "{cpu,cuda}"],
+        "evaluate": ["Run a trained agent in the simulator", "--thresholds", "per seed and threshold"],
+        "bench": ["Measure this machine", "bare simulator's speed", "--workers"],
+    }.items(),
+)
+def test_help_says_what_a_command_does(command, phrases, c2iql):
+    status, out, err = c2iql(command, "--help")
+    assert (status, err) == (0, "")
+    assert f"usage: c2iql {command}" in out
+    for phrase in phrases:
+        assert phrase in words(out)
+    status, out, _ = c2iql("--help")
+    assert status == 0 and phrases[0] in words(out) and command in out
+
+
+def test_every_command_has_help_for_each_of_its_arguments(c2iql):
+    overview = words(c2iql("--help")[1])
+    for command in re.search(r"\{([\w,]+)\}", overview).group(1).split(","):
+        status, out, _ = c2iql(command, "--help")
+        assert status == 0
+        for argument in re.findall(r"^│ (--[\w-]+|[A-Z]+) ", out, flags=re.MULTILINE):
+            text = words(out).split(f" {argument} ")[-1]
+            assert re.search(r"[a-z]{2,} [a-z]{2,}", text.split("(default")[0]), (command, argument)
+
+
+def test_it_runs_as_a_module():
+    result = subprocess.run(
+        [sys.executable, "-m", "tutorial_lib", "tasks"], cwd=ROOT, capture_output=True, text=True
+    )
+    assert (result.returncode, result.stderr) == (0, "")
+    rows = {line.split()[0]: line.split() for line in result.stdout.splitlines()[1:]}
+    assert rows.keys() == TASKS.keys()
+    assert rows["CarCircle"][1:4] == ["300", "8", "2"]
+    assert "(30, 50, 70)" in " ".join(rows["CarCircle"])
+
+
+# --- Errors ---
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["train", "BallRum"], "unknown task 'BallRum': did you mean BallRun"),
+        (["fetch", "Hopper"], "unknown task 'Hopper'"),
+        (["collect", "AntRun"], "AntRun has no recipe yet"),
+        (["bench", "--task", "Ball"], "unknown task 'Ball'"),
+        (["train", "BallRun", "--algorithm", "SAC"], "unknown algorithm 'SAC': the algorithms are IQL"),
+        (["train", "BallRun", "--profile", "huge"], "unknown profile 'huge': the profiles are paper, small"),
+        (["train", "BallRun", "--option", "kappa=0.7"], "--option kappa=0.7: write NAME=VALUE with one of"),
+        (["train", "BallRun", "--option", "kappa_1"], "--option kappa_1: write NAME=VALUE"),
+        (["train", "BallRun", "--option", "kappa_1=high"], "--option kappa_1=high: the value must be float"),
+        (["train", "BallRun", "--option", "time_limits=off"], "must be Literal['rate', 'bootstrap', 'mask']"),
+        (["train", "BallRun", "--option", "shift_rewards=maybe"], "the value must be True or False"),
+        (["train", "BallRun", "--algorithm", "CIQL", "--threshold", "-3"], "must be zero or more, not -3.0"),
+        (["train", "BallRun", "--algorithm", "CIQL"], "CIQL is trained for one threshold"),
+        (["train", "BallRun", "--threshold", "30"], "C2IQL takes no threshold to train"),
+        (["train", "BallRun", "--data", "nowhere.hdf5"], "nowhere.hdf5: no such file"),
+        (["evaluate", "nowhere.safetensors"], "nowhere.safetensors: no such file: train an agent"),
+    ],
+)
+def test_an_error_is_one_line(arguments, message, c2iql):
+    status, out, err = c2iql(*arguments)
+    assert status == 1 and out == ""
+    assert err.startswith("c2iql: ") and message in err and err.count("\n") == 1
+
+
+def test_a_machine_without_cuda_says_so(c2iql, monkeypatch):
+    monkeypatch.setattr(cli.torch.cuda, "is_available", lambda: False)
+    for command in (["train", "BallRun"], ["bench"]):
+        status, _, err = c2iql(*command, "--device", "cuda")
+        assert status == 1 and err.startswith("c2iql: --device cuda") and err.count("\n") == 1
+
+
+@pytest.mark.parametrize("arguments", [[], ["learn"], ["train"], ["train", "BallRun", "--colour", "red"]])
+def test_what_cannot_be_understood_fails_without_a_traceback(arguments, c2iql):
+    status, out, err = c2iql(*arguments)
+    assert status == 2 and "Traceback" not in out + err and "--help" in out + err
+
+
+# --- Options ---
+
+
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [
+        ("kappa_2=0.65", 0.65),
+        ("steps=7", 7),
+        ("cost_kappa=0.8", 0.8),
+        ("cost_kappa=None", None),
+        ("shift_rewards=True", True),
+        ("normalise_observations=False", False),
+        ("crm=linear", "linear"),
+        ("value_lr=1e-5", 1e-5),
+    ],
+)
+def test_an_option_changes_its_field_and_no_other(option, value):
+    before = cli.get_profile("small")
+    after = cli.with_options(before, (option,))
+    name = option.split("=")[0]
+    assert getattr(after, name) == value and type(getattr(after, name)) is type(value)
+    assert dataclasses.replace(after, **{name: getattr(before, name)}) == before
+
+
+# --- From data to scores ---
+
+
+def test_train_and_evaluate(c2iql, data, tmp_path):
+    run = tmp_path / "run"
+    train = ["train", "BallRun", "--data", data, "--out", run, "--seeds", 0, 3, "--option", *TINY, "steps=4"]
+    status, out, _ = c2iql(*train, "kappa_2=0.65")
+    assert status == 0 and f"{run}/agent.safetensors: trained for 4 updates" in out
+    assert {p.name for p in run.iterdir()} == {"agent.safetensors", "checkpoint.safetensors", "metrics.csv"}
+    agent = load_agent(run / "agent.safetensors")
+    assert (agent.seeds, agent.config.profile, agent.config.kappa_2) == ((0, 3), "small", 0.65)
+
+    status, out, _ = c2iql("evaluate", run / "agent.safetensors", "--episodes", 2, "--workers", 1)
+    assert status == 0 and "cost_score" in out and f"{run}/results.csv: 12 episodes" in out
+    results = pd.read_csv(run / "results.csv")
+    assert sorted(set(results["threshold"])) == [30, 50, 70] and set(results["seed"]) == {0, 3}
+
+    other = tmp_path / "other.csv"
+    limits = ["--thresholds", 0, 12.5, "--episodes", 1, "--workers", 1, "--out", other]
+    assert c2iql("evaluate", run / "checkpoint.safetensors", *limits)[0] == 0
+    assert sorted(set(pd.read_csv(other)["threshold"])) == [0, 12.5]
+    status, _, err = c2iql("evaluate", run / "agent.safetensors", "--thresholds", -5, "--workers", 1)
+    assert status == 1 and "must be zero or more" in err and err.count("\n") == 1
+
+    status, _, err = c2iql(*train, "kappa_2=0.7")  # the folder is another run's
+    assert status == 1 and "is of another run" in err.splitlines()[-1]
+
+
+def test_a_folder_that_cannot_be_written_is_one_line_of_error(c2iql, data, tmp_path):
+    (tmp_path / "file").write_text("")
+    train = ["train", "BallRun", "--data", data, "--out", tmp_path / "file" / "run"]
+    status, _, err = c2iql(*train, "--algorithm", "IQL", "--option", *TINY, "steps=1")
+    assert status == 1 and "Traceback" not in err and err.splitlines()[-1].startswith("c2iql: ")
+
+
+def test_every_part_of_an_update_takes_time():
+    table = bench.training(TASKS["BallRun"], [("small", 1), ("small", 2)], rounds=1, seconds=0.02)
+    shares = table[list(bench.PARTS)].to_numpy()
+    assert (shares > 0).all() and shares.sum(1) == pytest.approx(1)
+    assert (table["hours"] * table["updates_per_second"] * 3600).tolist() == pytest.approx(
+        [cli.get_profile("small").steps] * 2
+    )
+
+
+def test_bench_prints_both_tables(c2iql, monkeypatch):
+    tiny = cli.with_options(cli.get_profile("small"), tuple(TINY))
+    monkeypatch.setattr(bench, "PROFILES", {"small": tiny})
+    monkeypatch.setattr(bench, "get_profile", lambda name: tiny)
+    status, out, err = c2iql("bench", "--task", "BallRun", "--rounds", 1, "--workers", 1)
+    assert status == 0, err
+    lines = [line.split() for line in out.splitlines()]
+    rows = [line for line in lines if line[:1] == ["small"]]
+    assert [row[1] for row in rows] == ["1", "3"]
+    for row in rows:
+        shares = [int(cell.rstrip("%")) for cell in row[4:]]
+        assert len(shares) == len(bench.PARTS) and 98 <= sum(shares) <= 102
+        assert float(row[2]) > 1
+    assert ["bare", "simulator", "1"] in [line[:3] for line in lines]
+    assert any(line[:2] == ["rollouts", "1"] and 0 < int(line[3].rstrip("%")) < 200 for line in lines)
