@@ -71,7 +71,7 @@ def test_the_set_up_is_checked(capsys):
 
 
 def test_a_missing_package_is_found(monkeypatch):
-    monkeypatch.setattr(checks, "PACKAGES", ("numpy", "no-such-package"))
+    monkeypatch.setattr(checks.start, "PACKAGES", ("numpy", "no-such-package"))
     with pytest.raises(AssertionError, match="all packages are installed"):
         checks.check_setup()
 

@@ -1,0 +1,10 @@
+"""Checks that follow a notebook's claims, and checkers for its exercises, one file per notebook.
+
+A check prints a line without the value that it found, so that a notebook's outputs compare across
+machines; where the claim fails, it raises AssertionError with the value. An exercise's checker never
+raises: it prints what is wrong, or OK.
+"""
+
+from tutorial_lib.checks.c2iql import *
+from tutorial_lib.checks.claims import *
+from tutorial_lib.checks.start import *

@@ -1,0 +1,7 @@
+"""The course's figures: each function draws one and returns it, closed, so that a notebook shows it once,
+where it is the last value of a cell. One file per idea of the course.
+"""
+
+from tutorial_lib.plotting.episodes import *
+from tutorial_lib.plotting.results import *
+from tutorial_lib.plotting.style import *
