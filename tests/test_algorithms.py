@@ -54,6 +54,7 @@ CONFIG = Config(
     shift_rewards=False,
 )
 LIMIT = 3.0
+FAMILY = ("IQL", "CIQL", "C2IQL w/o CR", "C2IQL w/o CC", "C2IQL")  # Algorithm 2, and what it is made of
 NETWORK_OF = {  # which network a loss trains
     "value": "value",
     "cost_value": "cost_value",
@@ -216,7 +217,7 @@ OPTIONS = [
 
 
 @pytest.mark.parametrize("options", OPTIONS, ids=str)
-@pytest.mark.parametrize("name", ALGORITHMS)
+@pytest.mark.parametrize("name", FAMILY)
 def test_an_updates_losses_are_algorithm_2s(name, options):
     if name == "CIQL" and ("cost_kappa" in options or "time_limits" in options):
         pytest.skip("CIQL is the paper's and has no such option")
@@ -255,7 +256,7 @@ def test_one_run_takes_the_same_step_as_several(name):
 # --- What each loss reaches ---
 
 
-@pytest.mark.parametrize("name", ALGORITHMS)
+@pytest.mark.parametrize("name", FAMILY)
 def test_a_loss_reaches_its_own_network_and_no_other(name):
     agent = make_agent(name)
     randomise(agent)
@@ -287,7 +288,7 @@ def test_a_loss_reaches_its_own_network_and_no_other(name):
 # --- Terminals and time limits ---
 
 
-@pytest.mark.parametrize("name", ALGORITHMS)
+@pytest.mark.parametrize("name", FAMILY)
 @pytest.mark.parametrize("cost_limits", ["rate", "bootstrap", "mask"])
 @pytest.mark.parametrize("reward_limits", ["bootstrap", "mask"])
 def test_which_ends_stop_the_bootstrap(name, cost_limits, reward_limits):
@@ -381,7 +382,7 @@ def test_every_run_draws_its_limits_from_its_own_generator():
 @pytest.mark.parametrize("name", ALGORITHMS)
 def test_a_threshold_is_given_where_it_is_needed_and_nowhere_else(name):
     kind = get_algorithm(name)
-    takes_one = name in ("CIQL", "C2IQL w/o CC")
+    takes_one = name in ("CIQL", "C2IQL w/o CC", "BC-Safe")
     assert kind(TASK, CONFIG, threshold=0 if takes_one else None).threshold == (0.0 if takes_one else None)
     with pytest.raises(ValueError, match=name):
         kind(TASK, CONFIG, threshold=None if takes_one else 3.0)

@@ -47,6 +47,7 @@ def train(
     steps = agent.config.steps if steps is None else steps
     generators = [torch.Generator().manual_seed(seed) for seed in agent.seeds]
     log = _resume(agent, generators, run_dir) if run_dir and (run_dir / CHECKPOINT).exists() else []
+    dataset = agent.select_episodes(dataset)
     if not agent.updates:
         agent.prepare(dataset, progress)
     data = _training_data(dataset, agent)

@@ -91,6 +91,10 @@ class Agent:
         """
         raise NotImplementedError
 
+    def select_episodes(self, dataset: Dataset) -> Dataset:
+        """The part of the dataset that this algorithm learns from; `prepare` and training see no other."""
+        return dataset
+
     def prepare(self, dataset: Dataset, progress: bool = True) -> None:
         """Whatever must be learned from the whole dataset before the first update."""
         if self.config.normalise_observations:

@@ -1,0 +1,108 @@
+"""Behaviour cloning: its loss by a loop, what it clones, and which episodes the safe one sees."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from torch.func import functional_call
+
+from tutorial_lib.algorithms import get_algorithm
+from tutorial_lib.config import get_profile
+from tutorial_lib.datasets import Batch, Dataset, DatasetError
+from tutorial_lib.evaluation import evaluate
+from tutorial_lib.tasks import get_task
+from tutorial_lib.training import load_agent, save_agent, train
+
+TASK = get_task("BallRun")
+CONFIG = dataclasses.replace(
+    get_profile("small"), hidden_width=16, hidden_layers=1, batch_size=64, steps=1_000, profile="test"
+)
+CHEAP, DEAR = np.array([0.6, -0.2]), np.array([-0.4, 0.7])
+
+
+def make_agent(name, threshold=None, seeds=(0,), **changes):
+    return get_algorithm(name)(TASK, dataclasses.replace(CONFIG, **changes), seeds, threshold)
+
+
+def make_dataset(costs=(10, 30, 31, 80), length=100):
+    """One episode for each of `costs`; those of at most 30 always take CHEAP, the others always DEAR."""
+    rng = np.random.default_rng(0)
+    rows = length * len(costs)
+    step_costs = np.concatenate([np.arange(length) < cost for cost in costs]).astype(np.float32)
+    actions = np.repeat([CHEAP if cost <= 30 else DEAR for cost in costs], length, axis=0)
+    return Dataset(
+        observations=rng.normal(size=(rows, TASK.obs_dim)).astype(np.float32),
+        next_observations=rng.normal(size=(rows, TASK.obs_dim)).astype(np.float32),
+        actions=actions.astype(np.float32),
+        rewards=np.zeros(rows, np.float32),
+        costs=step_costs,
+        terminals=np.zeros(rows, bool),
+        timeouts=np.arange(1, rows + 1) % length == 0,
+    )
+
+
+def taken(agent, run=0):
+    observations = np.random.default_rng(1).normal(size=(200, TASK.obs_dim))
+    return agent.act(observations, np.full(200, 30.0), run)
+
+
+def test_the_loss_is_the_mean_squared_error():
+    agent = make_agent("BC-All")
+    rng = np.random.default_rng(2)
+    s, a = rng.normal(size=(12, TASK.obs_dim)), rng.uniform(-1, 1, size=(12, TASK.act_dim))
+    weights = {k: v[0].detach() for k, v in agent.parameters["policy"].items()}
+    total = 0.0
+    for state, action in zip(s, a, strict=True):
+        x = torch.tensor(np.array([state]), dtype=torch.float32)
+        out = functional_call(agent.modules["policy"], weights, x)[0][0]
+        total += sum((o - w) ** 2 for o, w in zip(out.tolist(), action, strict=True))
+    fields = {name: torch.zeros(1, 12) for name in Batch._fields}
+    fields |= {"observations": torch.tensor(s[None]).float(), "actions": torch.tensor(a[None]).float()}
+    scalars = agent.update(Batch(**fields), [torch.Generator()])
+    assert scalars["policy_loss"].item() == pytest.approx(total / 24, rel=1e-4)
+
+
+def test_all_clones_the_mean_of_what_was_done_and_safe_what_the_safe_did():
+    data = make_dataset()
+    everyone, safe = make_agent("BC-All"), make_agent("BC-Safe", 30.0)
+    train(everyone, data, progress=False)
+    train(safe, data, progress=False)
+    assert np.abs(taken(safe) - CHEAP).mean() < 0.1
+    assert np.abs(taken(everyone).mean(0) - (CHEAP + DEAR) / 2).max() < 0.1  # states tell nothing here
+
+
+@pytest.mark.parametrize(("threshold", "kept"), [(9, 0), (10, 1), (30, 2), (31, 3), (79.5, 3), (80, 4)])
+def test_the_limit_itself_is_safe_and_no_safe_episode_is_an_error_that_says_so(threshold, kept):
+    agent, data = make_agent("BC-Safe", threshold), make_dataset()
+    if kept:
+        assert agent.select_episodes(data).episode_costs.tolist() == [10, 30, 31, 80][:kept]
+    else:
+        with pytest.raises(DatasetError, match="BC-Safe: no episode costs at most 9: the cheapest of 4"):
+            train(agent, data, progress=False)
+    assert make_agent("BC-All").select_episodes(data) is data
+
+
+def test_observations_are_normalised_by_what_is_trained_on():
+    data, agent = make_dataset(), make_agent("BC-Safe", 30.0, steps=1)
+    train(agent, data, progress=False)
+    np.testing.assert_allclose(agent.observation_mean, data.observations[:200].mean(0), atol=1e-5)
+
+
+def test_killed_and_resumed_it_still_sees_safe_episodes_alone(tmp_path):
+    data = make_dataset()
+    train(make_agent("BC-Safe", 30.0), data, steps=200, run_dir=tmp_path, progress=False)
+    resumed, whole = make_agent("BC-Safe", 30.0), make_agent("BC-Safe", 30.0)
+    train(resumed, data, run_dir=tmp_path, progress=False)
+    train(whole, data, progress=False)
+    np.testing.assert_array_equal(taken(resumed), taken(whole))
+
+
+def test_saved_loaded_and_evaluated_like_any_agent(tmp_path):
+    for name, threshold, limits in (("BC-All", None, [30, 50, 70]), ("BC-Safe", 30.0, [30])):
+        agent = make_agent(name, threshold, seeds=(0, 4))
+        train(agent, make_dataset(), steps=3, progress=False)
+        save_agent(agent, tmp_path / "agent.safetensors")
+        results = evaluate(load_agent(tmp_path / "agent.safetensors"), episodes=1)
+        assert sorted(set(results["threshold"])) == limits and set(results["seed"]) == {0, 4}
+        assert set(results["algorithm"]) == {name} and results["predicted_cost"].isna().all()
