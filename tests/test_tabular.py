@@ -223,20 +223,18 @@ def test_the_budget_optimum_against_every_future(seed):
     assert (policy[:, 0, 1] == -1).all() and (policy[:, 2] >= 0).all()
 
 
-def test_the_budget_optimum_plays_as_promised(rng):
-    cmdp, horizon, n = shortcut(0.2), 12, 20_000
-    values, policy = tabular.budget_optimum(cmdp, horizon, 3)
-    state, left, total = np.full(n, 10), np.full(n, 3), np.zeros(n)
-    runs = np.ones(n, bool)
-    for t in range(horizon):
-        action = policy[t, left, state]
-        runs &= action >= 0
-        total += runs * cmdp.rewards[state, action]
-        left = left - np.where(runs, cmdp.costs[state, action], 0).astype(int)
-        below = cmdp.transitions[state, action].cumsum(1) < rng.random((n, 1))
-        state = np.where(runs, below.sum(1), state)
-    assert left.min() == 0
-    assert total.mean() == pytest.approx(values[0, 3, 10], abs=0.06)
+@pytest.mark.parametrize("budget", [0, 3])
+def test_the_budget_optimum_plays_as_promised(rng, budget):
+    cmdp, horizon = shortcut(0.2), 12
+    values, policy = tabular.budget_optimum(cmdp, horizon, budget)
+    played = tabular.play_budget(cmdp, policy, 20_000, rng)
+    assert played.costs.sum(1).max() == budget
+    assert played.rewards.sum(1).mean() == pytest.approx(values[0, budget, 10], abs=0.06)
+    stopped = played.actions[:, -1] == -1
+    assert 0 < stopped.mean() < 0.5
+    on_hazards = np.isin(played.states, [7, 11, 12, 13])  # stopped there, with nothing left to spend
+    assert on_hazards[stopped, -1].all() and not (on_hazards & (played.costs == 0))[~stopped].any()
+    assert (played.rewards[stopped] == 0).all() and (played.rewards[~stopped].sum(1) > 0).any()
 
 
 def test_a_budget_for_certain():
