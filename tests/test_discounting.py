@@ -7,7 +7,15 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from tutorial_lib.discounting import average_threshold, discounted_sums, misjudged, random_cost_sequences
+from tutorial_lib.datasets import Dataset
+from tutorial_lib.discounting import (
+    average_threshold,
+    cost_sequences,
+    discounted_sums,
+    misjudged,
+    random_cost_sequences,
+    settled_share,
+)
 
 KINDS = ("uniform", "block", "beta")
 
@@ -68,6 +76,30 @@ def test_misjudged_is_its_loop():
     shares = misjudged(cost, estimate, 5, 3)
     assert shares.false_positives == positives / 500 and shares.false_negatives == negatives / 500
     assert positives != negatives
+
+
+def test_an_episode_cut_short_costs_nothing_more():
+    costs = np.array([1, 0, 1, 1, 0, 2.5, 1], np.float32)  # episodes of 3, 1 and 3 steps
+    ends = np.isin(np.arange(7), (2, 3, 6))
+    zeros = np.zeros((7, 1), np.float32)
+    fell = ends & (np.arange(7) == 3)
+    dataset = Dataset(zeros, zeros, zeros, zeros[:, 0], costs, fell, ends & ~fell)
+    np.testing.assert_array_equal(cost_sequences(dataset, 4), [[1, 0, 1, 0], [1, 0, 0, 0], [0, 2.5, 1, 0]])
+
+
+@pytest.mark.parametrize(("gamma", "tau"), [(0.9, 0.1), (0.99, 0.005), (0.5, 1.0)])
+def test_settled_share_is_a_critic_that_always_meets_its_targets(gamma, tau):
+    """Ten states in a ring that all cost 1; the critic is set to its targets, and its copy follows."""
+    copy = np.zeros(10)
+    for update in range(1, 301):
+        critic = 1 + gamma * np.roll(copy, -1)
+        copy = (1 - tau) * copy + tau * critic
+        assert settled_share(gamma, update, tau) == pytest.approx(copy.mean() * (1 - gamma))
+
+
+def test_nothing_is_settled_before_the_first_update():
+    np.testing.assert_array_equal(settled_share(np.array([0.5, 0.9]), [[0], [1]], 0.1)[0], [0, 0])
+    assert settled_share(0.9, 1, 0.1) == pytest.approx(0.01)  # tau of a value of 10 is 1: the first cost
 
 
 # --- Random sequences ---

@@ -4,6 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from tutorial_lib.datasets import Dataset
+
 
 def discounted_sums(costs: np.ndarray, gammas) -> np.ndarray:
     """sum_t gamma^t c_t of each sequence for each gamma: costs (..., T) and m gammas give (..., m)."""
@@ -16,6 +18,24 @@ def average_threshold(limit, gamma: float, horizon: int):
     if not 0 < gamma < 1:
         raise ValueError(f"gamma must lie in (0, 1), not {gamma}")
     return limit / horizon * (1 - gamma**horizon) / (1 - gamma)
+
+
+def cost_sequences(dataset: Dataset, horizon: int) -> np.ndarray:
+    """The costs of a dataset's episodes, (episodes, horizon) float32: one cut short costs nothing more."""
+    costs = np.zeros((dataset.num_episodes, horizon), np.float32)
+    for row, start, end in zip(costs, dataset.starts, dataset.ends, strict=True):
+        row[: end - start] = dataset.costs[start:end]
+    return costs
+
+
+def settled_share(gamma, updates, tau: float):
+    """The share of a steady cost's value that a critic can have learned after so many updates, from zero.
+
+    Its targets come from a copy that follows with Polyak step `tau`. Each update, the best that a critic
+    can do is to meet its target c + gamma q; then the copy's error shrinks by 1 - tau (1 - gamma), and
+    real critics are slower. With arrays: broadcast.
+    """
+    return 1 - (1 - tau * (1 - np.asarray(gamma))) ** np.asarray(updates)
 
 
 class Misjudged(NamedTuple):

@@ -12,7 +12,7 @@ from tqdm.auto import trange
 
 from tutorial_lib.config import Config
 from tutorial_lib.datasets import Dataset
-from tutorial_lib.discounting import discounted_sums, random_cost_sequences
+from tutorial_lib.discounting import cost_sequences, discounted_sums, random_cost_sequences
 from tutorial_lib.networks import mlp
 from tutorial_lib.tasks import Task
 
@@ -44,9 +44,7 @@ class CostReconstruction(nn.Module):
 
 def episode_sums(dataset: Dataset, task: Task) -> tuple[np.ndarray, np.ndarray]:
     """Algorithm 1's line 3: discounted sums (episodes, m) and sums (episodes,) of the dataset's costs."""
-    costs = np.zeros((dataset.num_episodes, task.horizon), np.float32)
-    for row, start, end in zip(costs, dataset.starts, dataset.ends, strict=True):
-        row[: end - start] = dataset.costs[start:end]  # an episode cut short costs nothing more
+    costs = cost_sequences(dataset, task.horizon)
     return discounted_sums(costs, task.gammas), costs.sum(1)
 
 

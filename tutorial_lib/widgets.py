@@ -37,6 +37,18 @@ def limit_slider(agent, limit: float = 40, seed: int = 10) -> Controls:
     return Controls(lambda limit, seed: play(agent, limit, seed), limit=limits, seed=starts)
 
 
+def when_it_falls(gamma: float = 0.99, start: int = 0) -> Controls:
+    """`plotting.falling_cost` with a slider for the discount factor and one for when the cost falls."""
+    gammas = ipywidgets.SelectionSlider(
+        options=[0.9, 0.95, 0.97, 0.98, 0.985, 0.99, 0.993, 0.995, 0.998, 0.999],
+        value=gamma,
+        description="gamma",
+        **SLIDER,
+    )
+    starts = ipywidgets.IntSlider(start, 0, 260, 5, description="first unsafe step", **SLIDER)
+    return Controls(lambda gamma, start: plotting.falling_cost(gamma, start), gamma=gammas, start=starts)
+
+
 def print_lines(function, first: int, last: int | None = None) -> None:
     """Prints the paragraph of a function that its comment calls lines `first` to `last` (of Algorithm 2).
 

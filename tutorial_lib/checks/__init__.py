@@ -7,4 +7,5 @@ raises: it prints what is wrong, or OK.
 
 from tutorial_lib.checks.c2iql import *
 from tutorial_lib.checks.claims import *
+from tutorial_lib.checks.discounting import *
 from tutorial_lib.checks.start import *

@@ -1,0 +1,156 @@
+"""Notebook 04's figures, slider and exercises: do they show and say what is the case?"""
+
+import itertools
+
+import matplotlib
+import numpy as np
+import pytest
+
+from tutorial_lib import checks, plotting, widgets
+
+
+@pytest.fixture(autouse=True)
+def without_a_screen():
+    matplotlib.use("Agg")
+
+
+# --- Exercises ---
+
+STEADY = sum(0.8**t * 0.3 for t in range(10))
+"""L~ of 3 in 10 steps at gamma = 0.8."""
+
+
+def verdict(checker, costs, capsys):
+    checker(costs)
+    said = capsys.readouterr().out
+    assert said.count("\n") == 1
+    return said
+
+
+def test_every_sequence_of_ten_steps_gets_its_verdict(capsys):
+    found = {"positive": 0, "negative": 0}
+    for costs in itertools.product((0, 1), repeat=10):
+        rejected = sum(0.8**t for t, c in enumerate(costs) if c) > STEADY
+        positive, negative = sum(costs) <= 3 and rejected, sum(costs) > 3 and not rejected
+        assert verdict(checks.check_false_positive, costs, capsys).startswith("OK") == positive
+        assert verdict(checks.check_false_negative, list(costs), capsys).startswith("OK") == negative
+        found["positive"] += positive
+        found["negative"] += negative
+    assert min(found.values()) > 5
+
+
+@pytest.mark.parametrize(
+    ("checker", "costs", "hint"),
+    [
+        (checks.check_false_positive, [1, 1, 1, 1, 0, 0, 0, 0, 0, 0], "more than the limit"),
+        (checks.check_false_positive, [0, 0, 0, 0, 0, 0, 0, 1, 1, 1], "fall earlier"),
+        (checks.check_false_negative, [0, 0, 0, 0, 0, 0, 0, 1, 1, 1], "within the limit"),
+        (checks.check_false_negative, [1, 1, 1, 1, 0, 0, 0, 0, 0, 0], "fall later"),
+        (checks.check_false_negative, ..., "no costs"),
+        (checks.check_false_positive, None, "no costs"),
+        (checks.check_false_positive, [1, 1], "there are 10 steps"),
+        (checks.check_false_positive, [2] + [0] * 9, "0 or 1"),
+        (checks.check_false_negative, "early", "no sequence"),
+    ],
+)
+def test_a_wrong_sequence_gets_its_hint(checker, costs, hint, capsys):
+    said = verdict(checker, costs, capsys)
+    assert said.startswith("NOT YET  ") and hint in said
+
+
+def extremes(horizon, gamma, limit):
+    mark = sum(gamma**t * limit / horizon for t in range(horizon))
+    fewest = next(k for k in range(horizon + 1) if sum(gamma**t for t in range(k)) > mark)
+    late = [sum(gamma**t for t in range(horizon - k, horizon)) <= mark for k in range(horizon + 1)]
+    return fewest, max(k for k, accepted in enumerate(late) if accepted)
+
+
+def test_the_extremes(capsys):
+    checks.check_extremes(extremes)
+    assert capsys.readouterr().out == "OK  extremes is right in 4 cases\n"
+    assert extremes(301, 0.99, 50) == (18, 144)  # which notebook 04 says
+
+
+@pytest.mark.parametrize(
+    "mistake",
+    [
+        lambda T, gamma, limit: extremes(T, gamma, limit)[::-1],
+        lambda T, gamma, limit: (extremes(T, gamma, limit)[0] - 1, extremes(T, gamma, limit)[1]),
+        lambda T, gamma, limit: (extremes(T, gamma, limit)[0], extremes(T, gamma, limit)[1] + 1),
+        lambda T, gamma, limit: (limit, limit),
+        lambda T, gamma, limit: None,
+        lambda T, gamma, limit: 1 / 0,
+    ],
+)
+def test_wrong_extremes_are_told(mistake, capsys):
+    checks.check_extremes(mistake)
+    assert capsys.readouterr().out.startswith("NOT YET  ")
+
+
+# --- Figures ---
+
+
+def test_timelines_show_every_unsafe_step_and_both_ratios():
+    costs = np.array([[1, 0, 1, 0], [0, 0, 0, 1.0]])
+    steps, bars = plotting.timelines(costs, gamma=0.5, limit=1).axes[:2]
+    drawn = [patch for patch in steps.patches if patch.get_width() == 1]
+    assert [patch.get_x() for patch in drawn] == [0, 2, 3]
+    assert drawn[0].get_facecolor()[3] > drawn[1].get_facecolor()[3] > drawn[2].get_facecolor()[3]
+    widths = [patch.get_width() for patch in bars.patches]
+    assert widths == pytest.approx([2, 1, 1.25 / 0.46875, 0.125 / 0.46875])
+
+
+@pytest.mark.parametrize("gamma", [0.9, 0.99])
+def test_falling_cost_marks_the_starts_at_which_the_discounted_limit_is_wrong(gamma):
+    axes = plotting.falling_cost(gamma, 30).axes
+    lines = {line.get_label(): line for line in axes[1].lines}
+    mark = sum(gamma**t * 50 / 301 for t in range(301))
+    for length, label in ((40, plotting.FALSE_POSITIVE), (60, plotting.FALSE_NEGATIVE)):
+        wrong = np.isfinite(lines[label].get_ydata())
+        for start in range(0, 301 - length + 1, 7):
+            rejected = sum(gamma**t for t in range(start, start + length)) > mark
+            assert wrong[start] == (rejected == (length <= 50))
+
+
+def test_mismatch_counts_and_colours_what_it_misjudges():
+    cost, estimate = np.array([1, 4, 6, 9.0]), np.array([1, 5, 2, 9.0])
+    figure = plotting.mismatch({"first": (cost, estimate, 5, 4), "second": (cost, cost, 5, 5)})
+    first, second = figure.axes
+    assert [text.get_text() for text in first.texts] == ["25.0%", "25.0%"]
+    assert [text.get_text() for text in second.texts] == ["0.0%", "0.0%"]
+    at = {line.get_color(): line.get_xdata() for line in first.lines if len(line.get_xdata()) == 1}
+    assert at[plotting.REWARD] == [4] and at[plotting.COST] == [6]
+
+
+def test_misjudged_shares_stand_side_by_side_in_percent():
+    counts = {"BallRun": {30: (0.1, 0.2), 50: (0.0, 0.3)}, "CarRun": {10: (0.4, 0.5)}}
+    ball, car = plotting.misjudged_shares(counts).axes
+    assert [patch.get_height() for patch in ball.patches] == pytest.approx([10, 0, 20, 30])
+    assert [patch.get_height() for patch in car.patches] == pytest.approx([40, 50])
+    assert [label.get_text() for label in ball.get_xticklabels()] == ["30", "50"]
+
+
+def test_eight_tasks_have_two_lines_of_panels():
+    figure = plotting.misjudged_shares({f"task {i}": {30: (0.1, 0.2)} for i in range(5)})
+    assert len(figure.axes) == 8 and sum(ax.get_visible() for ax in figure.axes) == 5
+
+
+def test_long_memory_has_a_line_per_name_and_a_dot_per_mark():
+    gammas = np.array([0.9, 0.99, 0.999])
+    figure = plotting.long_memory(gammas, {"a": [0.3, 0.2, 0.1]}, [1e3, 1e4, 1e5], marked=(0.99,))
+    left, right = figure.axes
+    np.testing.assert_allclose(left.lines[0].get_ydata(), [30, 20, 10])
+    np.testing.assert_allclose(left.lines[0].get_xdata(), [10, 100, 1000])
+    assert right.lines[-1].get_xydata().ravel() == pytest.approx([100, 1e4])
+
+
+# --- The slider ---
+
+
+def test_the_sliders_draw_another_picture():
+    control = widgets.when_it_falls(gamma=0.99, start=0)
+    gamma, start = control.kwargs_widgets
+    assert control.result.axes[0].get_title() == r"$\gamma$ = 0.99, both blocks start at step 0"
+    gamma.value, start.value = 0.9, 120
+    assert control.result.axes[0].get_title() == r"$\gamma$ = 0.9, both blocks start at step 120"
+    assert repr(control) == "(Run the notebook for sliders: gamma and first unsafe step.)"
