@@ -268,6 +268,41 @@ def test_render_shows_the_robot_move(name):
     assert (env.render() != first).any()
 
 
+def redness(env):
+    """The share of the picture that is red: the sphere, and a little of the car."""
+    red, green, blue = np.moveaxis(env.render().astype(int), -1, 0)
+    return float(np.mean((red > 100) & (green < 60) & (blue < 60)))
+
+
+@every_task
+def test_a_red_sphere_surrounds_the_robot_exactly_while_it_is_unsafe(name):
+    env = make_env(name, render_mode="rgb_array", image_size=(160, 120))
+    still = np.zeros(env.task.act_dim)
+    for _ in range(2):  # an episode that ends unsafe leaves no sphere to the next
+        env.reset(seed=0)
+        assert redness(env) < 0.002
+        env.step(still)
+        assert redness(env) < 0.002
+        put(env, *((6.5, 0) if name.endswith("Circle") else (0, 2.5)), 0, 0)
+        assert env.step(still)[-1]["cost"] == 1
+        assert redness(env) > 0.003
+    env.step(still)
+    put(env, 0, 0, 0, 0)
+    assert env.step(still)[-1]["cost"] == 0
+    assert redness(env) < 0.002
+
+
+@every_task
+def test_the_pixel_is_where_the_picture_changes_when_the_robot_vanishes(name):
+    env = make_env(name, render_mode="rgb_array", image_size=(320, 240))
+    env.reset(seed=1)
+    with_robot, (column, row) = env.render().astype(int), env.pixel
+    env._sim.agent.set_position((0, 0, -50))  # below the floor
+    rows, columns = np.nonzero(np.abs(env.render() - with_robot).sum(-1) > 30)
+    assert len(rows) > 5
+    assert abs(columns.mean() - column) < 5 and abs(rows.mean() - row) < 5
+
+
 def test_rendering_does_not_disturb_the_episode():
     env = make_env("BallCircle", render_mode="rgb_array", image_size=(16, 12))
     step, env.step = env.step, lambda action: (env.render(), step(action))[1]

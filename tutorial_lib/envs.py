@@ -45,6 +45,7 @@ class BulletTask(gymnasium.Env):
         self._forget_last_episode()
         with _global_numpy_seed(int(self.np_random.integers(2**32))):
             observation, _ = self._sim.reset()
+        self._hide_red_sphere()
         self._steps = 0
         return observation.astype(np.float32), {"cost": 0.0}
 
@@ -66,18 +67,15 @@ class BulletTask(gymnasium.Env):
         )
 
     def render(self):
-        """The scene as (height, width, 3) uint8, drawn off-screen; None without `render_mode`."""
+        """The scene as (height, width, 3) uint8, drawn off-screen; None without `render_mode`.
+
+        A red sphere surrounds a robot whose last step was unsafe.
+        """
         if self.render_mode is None:
             return None
-        client, camera = self._sim.bc, self._sim.world.camera
+        client = self._sim.bc
         width, height = self.image_size
-        view = client.computeViewMatrixFromYawPitchRoll(
-            camera.cam_base_pos, camera.cam_dist, camera.cam_yaw, camera.cam_pitch, 0, 2
-        )
-        projection = client.computeProjectionMatrixFOV(
-            fov=60, aspect=width / height, nearVal=0.1, farVal=100.0
-        )
-        pixels = client.getCameraImage(width, height, view, projection, renderer=client.ER_TINY_RENDERER)[2]
+        pixels = client.getCameraImage(width, height, *self._camera(), renderer=client.ER_TINY_RENDERER)[2]
         return np.asarray(pixels, np.uint8).reshape(height, width, 4)[..., :3]
 
     def close(self):
@@ -87,6 +85,32 @@ class BulletTask(gymnasium.Env):
     def position(self) -> np.ndarray:
         """The robot's (x, y) in metres: what the Run and Circle costs look at."""
         return self._sim.agent.get_position()[:2]
+
+    @property
+    def pixel(self) -> tuple[float, float]:
+        """Where `render` shows the robot's middle: (column, row), in pixels from the upper left corner."""
+        view, projection = (np.reshape(matrix, (4, 4)).T for matrix in self._camera())  # stored by columns
+        x, y, _, w = projection @ view @ [*self._sim.agent.get_position(), 1.0]
+        width, height = self.image_size
+        return float((x / w + 1) / 2 * width), float((1 - y / w) / 2 * height)
+
+    def _camera(self):
+        """The view and projection matrices of the simulator's camera."""
+        client, camera = self._sim.bc, self._sim.world.camera
+        width, height = self.image_size
+        view = client.computeViewMatrixFromYawPitchRoll(
+            camera.cam_base_pos, camera.cam_dist, camera.cam_yaw, camera.cam_pitch, 0, 2
+        )
+        return view, client.computeProjectionMatrixFOV(60, width / height, nearVal=0.1, farVal=100.0)
+
+    def _hide_red_sphere(self):
+        """The simulator puts a red sphere around a robot whose last step was unsafe, and only then.
+
+        It leaves it from one episode to the next, and begins with one that is almost transparent, which
+        off-screen is opaque: at a reset it is taken away.
+        """
+        self._sim.agent._violates_constraints = True  # so that a change is seen
+        self._sim.agent.violates_constraints(False)
 
     def _forget_last_episode(self):
         """Drop the motor commands and contacts that the simulator keeps: its reset steps the physics once."""

@@ -33,7 +33,6 @@ def film(agent, limit: float, seed: int, steps, image_size=(360, 270), run: int 
     """
     env = make_env(agent.task, render_mode="rgb_array", image_size=image_size)
     observation, _ = env.reset(seed=seed)
-    _hide_red_sphere(env)
     frames, costs, spent = [], [], 0.0
     for t in range(max(steps) + 1):
         if t in steps:
@@ -46,13 +45,6 @@ def film(agent, limit: float, seed: int, steps, image_size=(360, 270), run: int 
             break
     env.close()
     return np.stack(frames), np.array(costs)
-
-
-def _hide_red_sphere(env):
-    """Until the first unsafe step the simulator makes it almost transparent, which off-screen is opaque."""
-    robot = env._sim.agent
-    robot._violates_constraints = True
-    robot.violates_constraints(False)
 
 
 def multiple_exposure(frames: np.ndarray) -> np.ndarray:
