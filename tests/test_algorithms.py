@@ -238,7 +238,7 @@ def test_an_updates_losses_are_algorithm_2s(name, options):
         assert {f"{loss}_loss" for loss in NETWORK_OF} & scalars.keys() <= slow[run].keys()
 
 
-@pytest.mark.parametrize("name", ALGORITHMS)
+@pytest.mark.parametrize("name", FAMILY)
 def test_one_run_takes_the_same_step_as_several(name):
     """The lift over seeds is skipped for one run: the other path must have the same losses."""
     pair, single = make_agent(name, seeds=(0, 1)), make_agent(name)
@@ -382,7 +382,7 @@ def test_every_run_draws_its_limits_from_its_own_generator():
 @pytest.mark.parametrize("name", ALGORITHMS)
 def test_a_threshold_is_given_where_it_is_needed_and_nowhere_else(name):
     kind = get_algorithm(name)
-    takes_one = name in ("CIQL", "C2IQL w/o CC", "BC-Safe")
+    takes_one = name in ("CIQL", "C2IQL w/o CC", "BC-Safe", "CPQ")
     assert kind(TASK, CONFIG, threshold=0 if takes_one else None).threshold == (0.0 if takes_one else None)
     with pytest.raises(ValueError, match=name):
         kind(TASK, CONFIG, threshold=None if takes_one else 3.0)

@@ -95,3 +95,53 @@ def gaussian_log_prob(actions: Tensor, mean: Tensor, log_std: Tensor) -> Tensor:
     """log N(actions; mean, exp(log_std)), (B,), summed over the dimensions of the action; not squashed."""
     z = (actions - mean) * torch.exp(-log_std)
     return (-0.5 * z.square() - log_std - 0.5 * math.log(2 * math.pi)).sum(-1)
+
+
+class SquashedPolicy(nn.Module):
+    """tanh of a Gaussian whose mean and log-std both depend on the state, as in SAC and OSRL's baselines."""
+
+    LOG_STD = (-20.0, 2.0)
+
+    def __init__(self, obs_dim: int, act_dim: int, config: Config):
+        super().__init__()
+        self.net = mlp(obs_dim, config.hidden_width, config.hidden_layers, 2 * act_dim)
+
+    def forward(self, observations: Tensor, noise: Tensor | float = 0.0) -> tuple[Tensor, Tensor]:
+        """The action that standard normal noise (..., B, act) stands for, and the log-std (B, act).
+
+        Without noise it is tanh of the mean (B, act), which is what runs in the simulator.
+        """
+        mean, log_std = self.net(observations).chunk(2, -1)
+        log_std = log_std.clamp(*self.LOG_STD)
+        return torch.tanh(mean + log_std.exp() * noise), log_std
+
+
+class ActionEncoder(nn.Module):
+    """One half of a conditional VAE: q(z | s, a), a Gaussian over latents of twice the action's size."""
+
+    LOG_STD = (-4.0, 15.0)
+
+    def __init__(self, obs_dim: int, act_dim: int, width: int, layers: int):
+        super().__init__()
+        self.net = mlp(obs_dim + act_dim, width, layers, 4 * act_dim)
+
+    def forward(self, observations: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and log-std of the latent, both (B, 2 act)."""
+        mean, log_std = self.net(torch.cat([observations, actions], -1)).chunk(2, -1)
+        return mean, log_std.clamp(*self.LOG_STD)
+
+
+class ActionDecoder(nn.Module):
+    """The other half: the action (B, act), within (-1, 1), that a latent (B, 2 act) stands for in a state."""
+
+    def __init__(self, obs_dim: int, act_dim: int, width: int, layers: int):
+        super().__init__()
+        self.net = mlp(obs_dim + 2 * act_dim, width, layers, act_dim)
+
+    def forward(self, observations: Tensor, latents: Tensor) -> Tensor:
+        return torch.tanh(self.net(torch.cat([observations, latents], -1)))
+
+
+def latent_kl(mean: Tensor, log_std: Tensor) -> Tensor:
+    """KL divergence of N(mean, exp(log_std)) from N(0, 1), the mean over the latent's dimensions: (...,)."""
+    return 0.5 * (mean.square() + (2 * log_std).exp() - 2 * log_std - 1).mean(-1)

@@ -32,6 +32,7 @@ class Agent:
     conditioned = False  # does the policy take the limit as an input?
     constrained = True  # does training know a limit at all?
     targets: tuple[str, ...] = ()  # networks with a Polyak-averaged copy
+    frozen: tuple[str, ...] = ()  # networks that a loss looks through without training them
 
     def __init__(
         self,
@@ -82,12 +83,14 @@ class Agent:
         raise NotImplementedError
 
     def losses(
-        self, net: SimpleNamespace, batch: Batch, limit: Tensor
+        self, net: SimpleNamespace, batch: Batch, limit: Tensor, *noise: Tensor
     ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
         """One run's losses and other scalars on a batch of B transitions.
 
-        `net` holds the networks by name, and the target networks as `target_<name>`; `limit` is the
-        cost limit of each transition (B,). Every loss must reach only the network that it trains.
+        `net` holds the networks by name, the target networks as `target_<name>` and those named in
+        `frozen` as `frozen_<name>`: the online network, whose parameters get no gradient. `limit` is the
+        cost limit of each transition (B,), `noise` is what `draw_noise` drew. Every loss must reach only
+        the network that it trains.
         """
         raise NotImplementedError
 
@@ -104,6 +107,10 @@ class Agent:
     def draw_limits(self, generator: torch.Generator, batch_size: int) -> Tensor:
         """The cost limits of one run's batch, (B,)."""
         return torch.full((batch_size,), torch.inf if self.threshold is None else self.threshold)
+
+    def draw_noise(self, generator: torch.Generator, batch_size: int) -> tuple[Tensor, ...]:
+        """The random numbers that one run's losses need for a batch, drawn as its limits are; none here."""
+        return ()
 
     def learning_rate(self, name: str) -> float:
         """The learning rate of the network called `name` (Table 4)."""
@@ -131,15 +138,17 @@ class Agent:
         the targets of Q see V from before this step. (IQL's code updates V first; at these learning
         rates the difference is one step's worth, and one joint step is faster.)
         """
-        limits = torch.stack([self.draw_limits(g, batch.rewards.shape[1]) for g in generators]).to(
-            self.device
-        )
+        size = batch.rewards.shape[1]
+        limits = torch.stack([self.draw_limits(g, size) for g in generators]).to(self.device)
+        noise = zip(*[self.draw_noise(g, size) for g in generators], strict=True)  # by kind, not by run
+        noise = [torch.stack(runs).to(self.device) for runs in noise]
         if len(self.seeds) == 1:  # the same function without the lift, which is not free
             squeezed = _map(self.parameters, lambda p: p[0]), _map(self.target_parameters, lambda p: p[0])
-            loss, scalars = self._total(*squeezed, Batch(*(x[0] for x in batch)), limits[0])
+            own = Batch(*(x[0] for x in batch)), limits[0], *(x[0] for x in noise)
+            loss, scalars = self._total(*squeezed, *own)
             scalars = {name: value[None] for name, value in scalars.items()}
         else:
-            loss, scalars = vmap(self._total)(self.parameters, self.target_parameters, batch, limits)
+            loss, scalars = vmap(self._total)(self.parameters, self.target_parameters, batch, limits, *noise)
         self.optimiser.zero_grad()
         loss.sum().backward()  # runs share no parameter, so each gets its own gradient
         for group in self.optimiser.param_groups:
@@ -173,9 +182,8 @@ class Agent:
 
     def network(self, name: str, run: int = 0) -> Callable[..., Tensor]:
         """One network of one run, to be called."""
-        return _bind(
-            self.modules[name], {key: value[run].detach() for key, value in self.parameters[name].items()}
-        )
+        own = {key: value[run] for key, value in self.parameters[name].items()}
+        return _bind(self.modules[name], _detached(own))
 
     def state(self) -> dict[str, Tensor]:
         """Every tensor of the agent by a flat name: online.*, target.*, adam.* and the number of updates."""
@@ -218,12 +226,14 @@ class Agent:
             return self.build()
 
     def _total(
-        self, parameters, target_parameters, batch: Batch, limit: Tensor
+        self, parameters, target_parameters, batch: Batch, limit: Tensor, *noise: Tensor
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """One run's losses, summed, and its scalars, as a function of its parameters."""
         online = {name: _bind(self.modules[name], p) for name, p in parameters.items()}
         target = {f"target_{name}": _bind(self.modules[name], p) for name, p in target_parameters.items()}
-        losses, scalars = self.losses(SimpleNamespace(**online, **target), batch, limit)
+        frozen = {f"frozen_{n}": _bind(self.modules[n], _detached(parameters[n])) for n in self.frozen}
+        net = SimpleNamespace(**online, **target, **frozen)
+        losses, scalars = self.losses(net, batch, limit, *noise)
         scalars = {f"{name}_loss": loss for name, loss in losses.items()} | scalars
         return sum(losses.values()), {name: value.detach() for name, value in scalars.items()}
 
@@ -248,6 +258,10 @@ def cost_guess(task: Task, gammas: Sequence[float]) -> tuple[float, ...]:
 def _bind(module: nn.Module, parameters: dict[str, Tensor]) -> Callable[..., Tensor]:
     """The module as a function of its inputs alone, with these parameters for its own."""
     return lambda *inputs: functional_call(module, parameters, inputs)
+
+
+def _detached(parameters: dict[str, Tensor]) -> dict[str, Tensor]:
+    return {key: value.detach() for key, value in parameters.items()}
 
 
 def _map(parameters, function):

@@ -1,0 +1,323 @@
+"""CPQ against its equations written out as loops over transitions and samples, in plain numbers."""
+
+import dataclasses
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from torch.func import functional_call
+
+from tutorial_lib import training
+from tutorial_lib.algorithms import CPQ
+from tutorial_lib.config import Config
+from tutorial_lib.datasets import Batch, Dataset
+from tutorial_lib.tasks import TASKS
+
+T, B, OBS, ACT = 10, 8, 3, 2
+TASK = dataclasses.replace(
+    TASKS["BallRun"],
+    horizon=T,
+    obs_dim=OBS,
+    act_dim=ACT,
+    thresholds=(1, 3, 6),
+    cost_range=8,
+    min_return=-5.0,
+    max_return=40.0,
+)
+CONFIG = Config(profile="test", gamma=0.8, batch_size=B, steps=100, hidden_width=8, hidden_layers=1)
+LIMIT = 3.0
+NETWORKS_OF = {  # which networks a loss trains
+    "vae": {"encoder", "decoder"},
+    "critic": {"critics"},
+    "cost_critic": {"cost_critics"},
+    "policy": {"policy"},
+}
+
+
+def make_agent(seeds=(0,), threshold=LIMIT, **changes):
+    return CPQ(TASK, dataclasses.replace(CONFIG, **changes), seeds=seeds, threshold=threshold)
+
+
+def randomise(agent, seed):
+    """Random numbers in every tensor, so that online and target networks, and the runs, all differ."""
+    generator = torch.Generator().manual_seed(seed)
+    state = {key: value.clone() for key, value in agent.state().items()}
+    for value in state.values():
+        if value.is_floating_point():
+            value.copy_(0.5 * torch.randn(value.shape, generator=generator))
+    state["observation_std"] = 0.5 + state["observation_std"].abs()
+    agent.load_state(state)
+
+
+def random_batch(seed, runs=1):
+    rng = np.random.default_rng(seed)
+    fields = {
+        "observations": rng.normal(size=(runs, B, OBS)),
+        "actions": rng.uniform(-1, 1, size=(runs, B, ACT)),
+        "rewards": rng.normal(2, 4, size=(runs, B)),
+        "costs": rng.random((runs, B)) < 0.5,
+        "next_observations": rng.normal(size=(runs, B, OBS)),
+        "terminals": rng.random((runs, B)) < 0.3,
+        "timeouts": rng.random((runs, B)) < 0.3,
+    }
+    return Batch(**{key: torch.tensor(value, dtype=torch.float32) for key, value in fields.items()})
+
+
+# --- The equations as loops ---
+
+
+class Slow:
+    """One run, one transition and one sample at a time; the networks too are written out."""
+
+    def __init__(self, agent, run):
+        self.config, self.run = agent.config, run
+        self.state = {key: value.numpy().copy() for key, value in agent.state().items()}
+
+    def weights(self, prefix):
+        return [v[self.run].astype(float) for k, v in self.state.items() if k.startswith(prefix)]
+
+    def dense(self, network, *inputs):
+        """A stack of linear layers with ReLU between them, as numbers (out,)."""
+        x, layers = np.concatenate(inputs), self.weights(f"online.{network}.net.")
+        for weight, bias in zip(layers[::2], layers[1::2], strict=True):
+            x = weight @ x + bias
+            x = x if weight is layers[-2] else np.maximum(x, 0)
+        return x
+
+    def critic(self, kind, network, scale, *inputs):
+        """Each critic's value of one state and action, a list."""
+        values, layers = [], self.weights(f"{kind}.{network}.layers.")
+        for k in range(len(layers[0])):
+            x = np.concatenate(inputs)
+            for weight, bias in zip(layers[::2], layers[1::2], strict=True):
+                x = x @ weight[k] + bias[k, 0]
+                x = x if weight is layers[-2] else np.maximum(x, 0)
+            values.append(scale * (1 + x[0]))
+        return values
+
+    def q(self, kind, *inputs):
+        return self.critic(kind, "critics", 0.5 * 40 / T / (1 - self.config.gamma), *inputs)
+
+    def q_cost(self, kind, *inputs):
+        return self.critic(kind, "cost_critics", 3 / T / (1 - self.config.gamma), *inputs)
+
+    def act(self, s, noise):
+        out = self.dense("policy", s)
+        return np.tanh(out[:ACT] + np.exp(np.clip(out[ACT:], -20, 2)) * noise)
+
+    def latent(self, s, a):
+        out = self.dense("encoder", s, a)
+        return out[: 2 * ACT], np.clip(out[2 * ACT :], -4, 15)
+
+    def kl(self, s, a):
+        """From the textbook's formula, one dimension after the other."""
+        mean, log_std = self.latent(s, a)
+        terms = [(math.exp(z) ** 2 + m * m - 1) / 2 - z for m, z in zip(mean, log_std, strict=True)]
+        return sum(terms) / len(terms)
+
+    def losses(self, batch, latent_noise, next_noise, noise):
+        gamma = self.config.gamma
+        limit = LIMIT * sum(gamma**t for t in range(T)) / T
+        alpha = math.exp(self.state["online.multiplier.log"][self.run])
+        sums, samples = dict.fromkeys((f"{name}_loss" for name in NETWORKS_OF), 0.0), []
+        sums |= {"safe_fraction": 0.0, "negative_q": 0.0, "alpha": alpha}
+        for row in range(B):
+            x = Batch(*(field[row].numpy().astype(float) for field in batch))
+            mean, std = self.state["observation_mean"], self.state["observation_std"]
+            s, s_next = (x.observations - mean) / std, (x.next_observations - mean) / std
+            latent, log_std = self.latent(s, x.actions)
+            decoded = np.tanh(self.dense("decoder", s, latent + np.exp(log_std) * latent_noise[row]))
+            sums["vae_loss"] += (sum((decoded - x.actions) ** 2) / ACT + 0.5 * self.kl(s, x.actions)) / B
+
+            a_next = self.act(s_next, next_noise[row])
+            cost_next = min(self.q_cost("target", s_next, a_next))
+            q_next = min(self.q("target", s_next, a_next)) if cost_next <= limit else 0.0
+            y = x.rewards + (0.0 if x.terminals or x.timeouts else gamma * q_next)
+            y_cost = x.costs + (0.0 if x.terminals else gamma * cost_next)
+            sums["critic_loss"] += sum((y - q) ** 2 for q in self.q("online", s, x.actions)) / B
+            errors = [(y_cost - q) ** 2 for q in self.q_cost("online", s, x.actions)]
+            sums["cost_critic_loss"] += sum(errors) / B
+
+            samples += [(s, self.act(s, noise[n][row])) for n in range(10)]
+            action = self.act(s, noise[0][row])
+            safe = min(self.q_cost("online", s, action)) <= limit
+            q = min(self.q("online", s, action))
+            sums["policy_loss"] -= safe * q / B
+            sums["safe_fraction"] += safe / B
+            sums["negative_q"] += (q < 0) / B
+        outside = sorted(samples, key=lambda pair: self.kl(*pair))[-len(samples) // 4 :]
+        costs = [min(self.q_cost("online", *pair)) for pair in outside]
+        sums["outside_cost"] = sum(costs) / len(costs)
+        sums["cost_critic_loss"] -= alpha * (sums["outside_cost"] - 1.5 * limit)
+        sums["shortfall"] = 1.5 * limit - sums["outside_cost"]
+        return sums
+
+
+@pytest.mark.parametrize("seeds", [(4,), (4, 9)])
+def test_an_updates_losses_are_cpqs(seeds):
+    agent, batch = make_agent(seeds), random_batch(1, len(seeds))
+    noises = [agent.draw_noise(torch.Generator().manual_seed(seed), B) for seed in seeds]
+    for seed in range(50):  # until safe and unsafe actions are there, or the batch shows nothing
+        randomise(agent, seed)
+        slow = [
+            Slow(agent, run).losses(Batch(*(x[run] for x in batch)), *(x.numpy() for x in noises[run]))
+            for run in range(len(seeds))
+        ]
+        if all(0.2 < one["safe_fraction"] < 0.8 for one in slow):
+            break
+    else:
+        pytest.fail("no batch with safe and unsafe actions")
+    scalars = agent.update(batch, [torch.Generator().manual_seed(seed) for seed in seeds])
+    for run, expected in enumerate(slow):
+        found = {key: value[run].item() for key, value in scalars.items()}
+        assert found == pytest.approx(expected, rel=1e-4, abs=1e-4)
+
+
+# --- What each loss reaches ---
+
+
+def losses_and_leaves(agent, change=None):
+    leaves = {}
+    for key, value in agent.state().items():
+        kind, _, rest = key.partition(".")
+        if kind in ("online", "target"):
+            network, _, parameter = rest.partition(".")
+            place = network if kind == "online" else f"target_{network}"
+            leaves.setdefault(place, {})[parameter] = value[0].clone().requires_grad_()
+
+    def bound(place, parameters):
+        module = agent.modules[place.removeprefix("target_")]
+        return lambda *inputs: functional_call(module, parameters, inputs)
+
+    net = SimpleNamespace(**{place: bound(place, leaves[place]) for place in leaves})
+    for name in agent.frozen:
+        values = {key: value.detach() for key, value in leaves[name].items()}
+        setattr(net, f"frozen_{name}", bound(name, values))
+    batch = Batch(*(field[0] for field in random_batch(1)))
+    noise = agent.draw_noise(torch.Generator().manual_seed(0), B)
+    return agent.losses(net, batch, torch.full((B,), LIMIT), *noise)[0], leaves
+
+
+def test_a_loss_reaches_its_own_networks_and_no_other():
+    agent = make_agent()
+    randomise(agent, 0)
+    losses, leaves = losses_and_leaves(agent)
+    assert losses.keys() == NETWORKS_OF.keys()
+    places = [(place, key) for place, parameters in leaves.items() for key in parameters]
+    for loss, value in losses.items():
+        tensors = [leaves[place][key] for place, key in places]
+        gradients = torch.autograd.grad(value, tensors, allow_unused=True, retain_graph=True)
+        reached = {p for p, g in zip(places, gradients, strict=True) if g is not None and g.any()}
+        assert reached == {(place, key) for place, key in places if place in NETWORKS_OF[loss]}, loss
+
+
+def test_the_price_of_actions_outside_has_a_gradient_in_proportion_to_the_multiplier():
+    """OSRL's has none: see the module's list of departures."""
+    gradients = []
+    for log in (0.0, 1.0, 2.0):
+        agent = make_agent()
+        randomise(agent, 0)
+        agent.parameters["multiplier"]["log"].data.fill_(log)
+        losses, leaves = losses_and_leaves(agent)
+        gradients.append(torch.autograd.grad(losses["cost_critic"], list(leaves["cost_critics"].values())))
+    for at_0, at_1, at_2 in zip(*gradients, strict=True):
+        one, two = at_1 - at_0, at_2 - at_0
+        torch.testing.assert_close(two, one * (math.e**2 - 1) / (math.e - 1), rtol=1e-3, atol=1e-5)
+    assert all((at_1 - at_0).abs().max() > 1e-3 for at_0, at_1, _ in zip(*gradients, strict=True))
+
+
+def test_the_multiplier_takes_a_plain_step_and_stays_within_its_bounds():
+    agent = make_agent(seeds=(0, 1))
+    generators = [torch.Generator().manual_seed(seed) for seed in (0, 1)]
+    log = agent.parameters["multiplier"]["log"]
+    for start, cost, expected in ((0.3, 2.0, None), (5.0, 0.0, 5.0), (-5.0, 90.0, -5.0)):
+        log.data.fill_(start)
+        agent.fill_last_bias(("cost_critics",), cost)
+        scalars = agent.update(random_batch(1, runs=2), generators)
+        for run in (0, 1):
+            missing = 1.5 * LIMIT * sum(0.8**t for t in range(T)) / T - scalars["outside_cost"][run].item()
+            step = start + 1e-4 * math.exp(start) * missing if expected is None else expected
+            assert log[run].item() == pytest.approx(step, abs=1e-6)
+            assert (missing > 0) == (cost == 0.0)
+    log.data.fill_(5.0)
+    agent.fill_last_bias(("cost_critics",), 90.0)
+    agent.update(random_batch(1, runs=2), generators)
+    assert (log < 5.0).all()  # a bound can be left
+
+
+# --- Noise and checkpoints ---
+
+
+def dataset(rows=200, low=-1.0, high=1.0, cost=0.4, terminal=False):
+    rng = np.random.default_rng(0)
+    return Dataset(
+        observations=rng.normal(size=(rows, OBS)).astype(np.float32),
+        next_observations=rng.normal(size=(rows, OBS)).astype(np.float32),
+        actions=rng.uniform(low, high, size=(rows, ACT)).astype(np.float32),
+        rewards=rng.normal(2, 1, size=rows).astype(np.float32),
+        costs=(rng.random(rows) < cost).astype(np.float32),
+        terminals=np.full(rows, terminal),
+        timeouts=(np.arange(1, rows + 1) % T == 0) & (not terminal),
+    )
+
+
+@pytest.mark.parametrize("seeds", [(3,), (3, 5)])
+def test_a_resumed_run_draws_the_noise_that_it_would_have_drawn(seeds, tmp_path, monkeypatch):
+    monkeypatch.setattr(training, "get_task", lambda name: TASK)
+    every = {"log_every": 1, "checkpoint_every": 10, "progress": False}
+    whole, first, second = (make_agent(seeds) for _ in range(3))
+    training.train(whole, dataset(), steps=20, **every)
+    training.train(first, dataset(), steps=10, run_dir=tmp_path, **every)
+    training.train(second, dataset(), steps=20, run_dir=tmp_path, **every)
+    state = second.state()
+    for key, value in whole.state().items():
+        assert torch.equal(state[key], value), key
+
+
+def test_each_run_draws_its_noise_from_its_own_generator():
+    agent, seen = make_agent(seeds=(3, 4)), []
+    draw = agent.draw_noise
+    agent.draw_noise = lambda *args: seen.append(draw(*args)) or seen[-1]
+    generators = [torch.Generator().manual_seed(seed) for seed in (3, 4)]
+    agent.update(random_batch(0, runs=2), generators)
+    assert [x.shape for x in seen[0]] == [(B, 2 * ACT), (B, ACT), (10, B, ACT)]
+    for seed, noises in zip((3, 4), seen, strict=True):
+        alone = draw(torch.Generator().manual_seed(seed), B)
+        assert all(torch.equal(x, y) for x, y in zip(noises, alone, strict=True))
+    assert not torch.equal(seen[0][1], seen[1][1])
+
+
+# --- What it learns ---
+
+
+def test_actions_outside_the_data_come_to_look_too_costly():
+    """Episodes of one free step, actions in a corner: these stay cheap, those far away do not."""
+    agent = make_agent(batch_size=64, hidden_width=32, critic_lr=1e-3, policy_lr=0.0)
+    data = dataset(low=0.6, high=0.9, cost=0.0, terminal=True)
+    log = training.train(agent, data, steps=400, log_every=100, progress=False)
+    limit = LIMIT * sum(0.8**t for t in range(T)) / T
+    assert log[0]["outside_cost"] < 1.5 * limit < log[-1]["outside_cost"]
+    assert log[0]["alpha"] > 1 > log[-1]["alpha"]  # the price falls again once it has had its effect
+    with torch.no_grad():
+        s = agent.network_input(torch.tensor(data.observations), None)
+        recorded = agent.network("cost_critics")(s, torch.tensor(data.actions)).amin(0)
+        opposite = agent.network("cost_critics")(s, -torch.tensor(data.actions)).amin(0)
+    assert recorded.abs().mean() < 0.3 * limit and (opposite > limit).float().mean() > 0.9
+
+
+def test_the_action_that_runs_is_the_squashed_mean_without_noise():
+    agent = make_agent()
+    randomise(agent, 3)
+    observations = np.random.default_rng(1).normal(size=(5, OBS))
+    slow = Slow(agent, 0)
+    inputs = (observations - slow.state["observation_mean"]) / slow.state["observation_std"]
+    expected = [slow.act(s, 0.0) for s in inputs]
+    np.testing.assert_allclose(agent.act(observations, np.full(5, LIMIT)), expected, atol=1e-5)
+    assert np.isnan(agent.predicted_cost(observations, np.full(5, LIMIT))).all()
+
+
+def test_an_infinite_threshold_is_refused():
+    with pytest.raises(ValueError, match="CPQ needs a finite threshold"):
+        make_agent(threshold=math.inf)

@@ -1,0 +1,156 @@
+"""Constraints penalized Q-learning (CPQ; Xu, Zhan and Zhu 2022; eqs. 3 and 4 of the C2IQL paper).
+
+The backup of CPQ asks the critics about actions of the policy, recorded or not. So a conditional VAE of the
+recorded actions tells which of them lie outside the data, and these are trained to look too costly.
+
+Settings are those of the benchmark's code (OSRL, `cpq.py`), from which we depart, or which we settle, thus:
+
+1. The cost of the actions outside is what the *online* cost critics say, and its gradient reaches them. In
+   OSRL's file that term sits inside `no_grad`, on the target networks: it trains nothing there.
+2. That cost is a mean over the actions outside, the paper's expectation. OSRL's is a mean over all samples,
+   with zeros for those inside, and so a quarter of it.
+3. Actions outside are squashed by tanh like those that run; OSRL's are taken before the tanh.
+4. The cost backup stops where the robot fell, as in CIQL; OSRL's never stops. (Ball and Car never fall.)
+
+As there: of two cost critics the *smaller* counts, and its first guess is zero, so that all looks safe; the
+multiplier takes a plain gradient step; the policy's learning rate stays as it is (the cosine belongs to IQL).
+"""
+
+import torch
+from torch import Tensor, nn
+
+from tutorial_lib import losses as L
+from tutorial_lib.algorithms.base import Agent, cost_guess, reward_guess
+from tutorial_lib.discounting import average_threshold
+from tutorial_lib.networks import ActionDecoder, ActionEncoder, Critics, SquashedPolicy, latent_kl
+
+SAMPLES = 10
+"""Actions of the policy per state, of which those outside the data are sought."""
+OUTSIDE_SHARE = 0.25
+"""Share of these samples, those with the largest KL divergence in the whole batch, that count as outside."""
+OUTSIDE_COST = 1.5
+"""What the cost critics should say of actions outside at least, in units of the limit."""
+KL_WEIGHT = 0.5
+"""Of the VAE's KL divergence against its mean squared error."""
+VAE_WIDTH = 400 / 256
+"""Width of the VAE's two hidden layers, relative to the other networks'."""
+POLICY_LR = 1 / 3
+"""Learning rate of the policy, relative to the profile's: 1e-4 in profile `paper`."""
+MULTIPLIER_LR = 1e-4
+"""Step of the multiplier's logarithm, for a multiplier of one, per unit of missing cost."""
+LOG_MULTIPLIER = 5.0
+"""Bound on that logarithm, on either side of zero."""
+
+
+class Multiplier(nn.Module):
+    """A positive number by its logarithm, which no loss trains: it is stepped in `CPQ.update`."""
+
+    def __init__(self):
+        super().__init__()
+        self.log = nn.Parameter(torch.zeros(()))
+
+    def forward(self) -> Tensor:
+        return self.log.exp()
+
+
+class CPQ(Agent):
+    """Equations 3 and 4 for one finite threshold L, compared with discounted costs as L~ (eq. 2)."""
+
+    name = "CPQ"
+    targets = ("critics", "cost_critics")
+    frozen = ("critics", "cost_critics")
+
+    def __init__(self, *args, **kwargs):
+        super().__init__(*args, **kwargs)
+        if self.threshold == float("inf"):
+            raise ValueError("CPQ needs a finite threshold: actions outside the data must cost more than it")
+        # Where all actions look unsafe the policy has no gradient (eq. 4), so let all look safe at first.
+        self.fill_last_bias(("cost_critics",), -1.0)
+
+    def build(self):
+        task, config = self.task, self.config
+        sizes = task.obs_dim, task.act_dim
+        vae = *sizes, round(VAE_WIDTH * config.hidden_width), 2
+        cost_scale = cost_guess(task, (config.gamma,))[0]
+        return {
+            "encoder": ActionEncoder(*vae),
+            "decoder": ActionDecoder(*vae),
+            "critics": Critics(*sizes, config, reward_guess(task, config)),
+            "cost_critics": Critics(*sizes, config, cost_scale, k=config.cost_critics),
+            "multiplier": Multiplier(),
+            "policy": SquashedPolicy(*sizes, config),
+        }
+
+    def learning_rate(self, name):
+        return super().learning_rate(name) * (POLICY_LR if name == "policy" else 1)
+
+    def draw_noise(self, generator, batch_size):
+        """For the latent (B, 2 act), the policy's action at s' (B, act), and those at s (10, B, act)."""
+        act = self.task.act_dim
+        shapes = (batch_size, 2 * act), (batch_size, act), (SAMPLES, batch_size, act)
+        return tuple(torch.randn(shape, generator=generator) for shape in shapes)
+
+    def update(self, batch, generators):
+        """All networks, then the multiplier: it grows while the actions outside look too cheap."""
+        scalars = super().update(batch, generators)
+        log = self.parameters["multiplier"]["log"]
+        with torch.no_grad():
+            step = MULTIPLIER_LR * log.exp() * scalars["shortfall"]
+            log.add_(step).clamp_(-LOG_MULTIPLIER, LOG_MULTIPLIER)
+        return scalars
+
+    def losses(self, net, batch, limit, latent_noise, next_noise, noise):
+        config, a = self.config, batch.actions
+        s, s_next = (self.network_input(x, limit) for x in (batch.observations, batch.next_observations))
+        limit = average_threshold(limit, config.gamma, self.task.horizon)
+
+        # The conditional VAE of the recorded actions.
+        mean, log_std = net.encoder(s, a)
+        decoded = net.decoder(s, mean + log_std.exp() * latent_noise)
+        vae_loss = (decoded - a).square().mean() + KL_WEIGHT * latent_kl(mean, log_std).mean()
+
+        # Eq. 3: what follows counts where the policy's action at s' looks safe. It may be outside the data.
+        a_next = net.policy(s_next, next_noise)[0].detach()
+        q_cost_next = net.target_cost_critics(s_next, a_next).amin(0)  # (B,)
+        q_next = L.penalised_q(net.target_critics(s_next, a_next).amin(0), q_cost_next, limit)
+        target = L.td_target(batch.rewards, config.gamma, q_next, self.reward_mask(batch))
+        critic_loss = L.td_loss(target, net.critics(s, a))
+
+        # Costs, with a price on every unit that the actions outside miss: alpha (1.5 L~ - Q_c).
+        samples = net.policy(s, noise)[0]  # (10, B, act)
+        outside_cost = net.cost_critics(*self._outside(net, s, samples.detach())).amin(0).mean()
+        shortfall = OUTSIDE_COST * limit[0] - outside_cost
+        target = L.td_target(batch.costs, config.gamma, q_cost_next, 1 - batch.terminals)
+        alpha = net.multiplier().detach()
+        cost_critic_loss = L.td_loss(target, net.cost_critics(s, a)) + alpha * shortfall
+
+        # Eq. 4: the policy, through critics that do not learn from it.
+        q_cost = net.frozen_cost_critics(s, samples[0]).amin(0)
+        q_reward = net.frozen_critics(s, samples[0]).amin(0)
+        policy_loss = -L.penalised_q(q_reward, q_cost, limit).mean()
+
+        losses = {
+            "vae": vae_loss,
+            "critic": critic_loss,
+            "cost_critic": cost_critic_loss,
+            "policy": policy_loss,
+        }
+        return losses, {
+            "safe_fraction": (q_cost <= limit).float().mean(),
+            "outside_cost": outside_cost,
+            "shortfall": shortfall,
+            "alpha": alpha,
+            "negative_q": (q_reward < 0).float().mean(),
+        }
+
+    def _cosine(self):
+        return 1.0
+
+    def _outside(self, net, s: Tensor, samples: Tensor) -> tuple[Tensor, Tensor]:
+        """States (n, obs) and actions (n, act): of samples (10, B, act) the least like the recorded ones."""
+        states = s.repeat(len(samples), 1)  # (10 B, obs)
+        actions = samples.flatten(0, 1)
+        with torch.no_grad():
+            kl = latent_kl(*net.encoder(states, actions))  # (10 B,)
+        rows = kl.topk(round(OUTSIDE_SHARE * len(kl))).indices
+        return states[rows], actions[rows]
