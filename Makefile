@@ -1,6 +1,8 @@
 # The course's commands. Each sets up .venv when it is missing, and works twice in a row.
 #
 #   make course      execute every notebook and make a site of them to browse
+#   make slides      lecture slides from the executed notebooks; they need no network
+#   make student     the notebooks without their solutions
 #   make test        the tests, then every notebook against its stored outputs
 #   make lab         JupyterLab on the notebooks
 #   make notebooks   execute the notebooks and store their outputs in them
@@ -25,7 +27,7 @@ export OMP_NUM_THREADS := 1
 export MKL_NUM_THREADS := 1
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: course test lab notebooks lock clean
+.PHONY: course slides student test lab notebooks lock clean
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
 
@@ -35,6 +37,18 @@ course: $(READY) $(EXECUTED)
 	@cp site/*.md build/pages && ln -sfn ../../data ../../tutorial_lib build/pages
 	@$(BIN) -m sphinx -q -W --keep-going -c site build/pages build/site
 	@echo "The course lies at $(CURDIR)/build/site/index.html: open it in a browser."
+
+# Beside links to what the notebooks' own links lead to, as the site.
+slides: $(READY) $(EXECUTED)
+	@rm -rf build/slides $(filter-out $(EXECUTED),$(wildcard build/pages/notebooks/*)) && mkdir -p build/slides
+	@ln -sfn ../data ../tutorial_lib build
+	@$(BIN) site/slides.py build/pages/notebooks build/slides
+	@echo "The slides lie at $(CURDIR)/build/slides/index.html: open it in a browser."
+
+student: $(READY)
+	@rm -rf build/student && mkdir -p build && ln -sfn ../data ../tutorial_lib build
+	@$(BIN) site/student.py notebooks build/student
+	@echo "The notebooks without solutions lie in $(CURDIR)/build/student."
 
 test: $(READY)
 	$(BIN) -m pytest tests
