@@ -97,13 +97,34 @@ def condition(limit, spent, t, horizon, thresholds):
     return min(thresholds, key=lambda threshold: abs(threshold - budget))
 
 
+def run_cost(y, speed, speed_limit):
+    return float(abs(y) > 2 or speed > speed_limit)
+
+
+def least_cost(cmdp):
+    """By value iteration, where the checker uses a linear programme."""
+    v = np.zeros(len(cmdp.initial))
+    for _ in range(600):
+        v = (cmdp.costs + cmdp.gamma * cmdp.transitions @ v).min(axis=1)
+    return cmdp.initial @ v
+
+
 ANSWERS = {
+    checks.check_run_cost: run_cost,
+    checks.check_least_cost: least_cost,
     checks.check_keeps_limit: keeps_limit,
     checks.check_normalised_return: normalised_return,
     checks.check_implicit_cost_value: implicit_cost_value,
     checks.check_condition: condition,
 }
 MISTAKES = [
+    (checks.check_run_cost, lambda y, speed, limit: float(y > 2 or speed > limit), "two walls"),
+    (checks.check_run_cost, lambda y, speed, limit: float(abs(y) > 2) + float(speed > limit), "1 at most"),
+    (checks.check_run_cost, lambda y, speed, limit: float(abs(y) >= 2 or speed >= limit), "still safe"),
+    (checks.check_run_cost, lambda y, speed, limit: float(abs(y) > 2 or speed > 2.5), "speed_limit"),
+    (checks.check_least_cost, lambda cmdp: cmdp.initial @ cmdp.costs.min(1), "at every step"),
+    (checks.check_least_cost, lambda cmdp: cmdp.initial @ cmdp.costs.min(1) / (1 - cmdp.gamma), "look ahead"),
+    (checks.check_least_cost, lambda cmdp: least_cost(cmdp) / cmdp.initial.max(), "cmdp.initial"),
     (checks.check_keeps_limit, lambda costs, limit: max(costs) <= limit, "expectation"),
     (checks.check_keeps_limit, lambda costs, limit: np.mean(costs) < limit, "at most"),
     (checks.check_keeps_limit, lambda costs, limit: np.median(costs) <= limit, "their mean is not"),

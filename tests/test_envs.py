@@ -160,6 +160,13 @@ def test_the_cost_is_one_outside_the_lines_or_above_the_speed_limit_and_else_zer
 
 
 @every_task
+def test_the_speed_limit_is_the_robots(name):
+    assert shared_env(name).speed_limit == next(
+        v[2] for robot, v in VELOCITY.items() if name.startswith(robot)
+    )
+
+
+@every_task
 def test_the_cost_keeps_its_meaning_through_an_episode(name):
     obs_dim = TASKS[name].obs_dim
     for row in reference(name)[1:]:

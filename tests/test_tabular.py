@@ -142,6 +142,7 @@ def test_solve_against_all_deterministic_policies(seed):
     with pytest.raises(ValueError, match="least achievable cost") as error:
         tabular.solve(cmdp, cost.min() - 1e-3)
     assert float(str(error.value).split()[-1]) == pytest.approx(cost.min(), abs=1e-5)
+    assert tabular.least_cost(cmdp) == pytest.approx(cost.min(), abs=1e-6)
     for limit in np.linspace(cost.min() + 1e-6, cost.max(), 7):
         best = reward[cost <= limit].max()  # one policy, or a mixture of a cheap and a dear one:
         for i, j in itertools.product(np.flatnonzero(cost <= limit), np.flatnonzero(cost > limit)):

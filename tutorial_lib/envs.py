@@ -87,6 +87,11 @@ class BulletTask(gymnasium.Env):
         return self._sim.agent.get_position()[:2]
 
     @property
+    def speed_limit(self) -> float:
+        """In m/s: what the Run costs look at besides the position."""
+        return self._sim.agent.velocity_constraint
+
+    @property
     def pixel(self) -> tuple[float, float]:
         """Where `render` shows the robot's middle: (column, row), in pixels from the upper left corner."""
         view, projection = (np.reshape(matrix, (4, 4)).T for matrix in self._camera())  # stored by columns

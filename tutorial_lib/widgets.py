@@ -49,6 +49,17 @@ def when_it_falls(gamma: float = 0.99, start: int = 0) -> Controls:
     return Controls(lambda gamma, start: plotting.falling_cost(gamma, start), gamma=gammas, start=starts)
 
 
+def shortcut(limit: float):
+    """The best policy of the tabular shortcut under a limit, and the limit's place on the Pareto frontier."""
+    return plotting.shortcut_under_limit(limit)
+
+
+def shortcut_slider(limit: float = 1.0) -> Controls:
+    """`shortcut` with a slider for the limit on the discounted cost, from 0, which none can keep."""
+    limits = ipywidgets.FloatSlider(limit, min=0, max=2.75, step=0.05, description="limit", **SLIDER)
+    return Controls(shortcut, limit=limits)
+
+
 def print_lines(function, first: int, last: int | None = None) -> None:
     """Prints the paragraph of a function that its comment calls lines `first` to `last` (of Algorithm 2).
 

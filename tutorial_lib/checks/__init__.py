@@ -7,5 +7,6 @@ raises: it prints what is wrong, or OK.
 
 from tutorial_lib.checks.c2iql import *
 from tutorial_lib.checks.claims import *
+from tutorial_lib.checks.cmdp import *
 from tutorial_lib.checks.discounting import *
 from tutorial_lib.checks.start import *

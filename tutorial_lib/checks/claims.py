@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from tutorial_lib.tabular import CMDP
 from tutorial_lib.tasks import Task
 
 
@@ -37,6 +38,8 @@ def check_that(claim: str, holds) -> None:
 def text(value) -> str:
     if isinstance(value, Task):
         return value.name
+    if isinstance(value, CMDP):
+        return f"a CMDP of {len(value.initial)} states"
     if np.ndim(value):
         return "[" + ", ".join(text(element) for element in value) + "]"
     is_number = isinstance(value, int | float | np.number | np.ndarray) and not isinstance(value, bool)

@@ -73,6 +73,6 @@ def simulate(cmdp: CMDP, policy: np.ndarray, horizon: int, n: int, rng: np.rando
 
 
 def draw(chances, rng):
-    """An index from each row of probabilities, (n, k) -> (n,)."""
+    """A random index from each row of probabilities, (n, k) -> (n,)."""
     below = chances.cumsum(1) < rng.random((len(chances), 1))
     return np.minimum(below.sum(1), chances.shape[1] - 1)

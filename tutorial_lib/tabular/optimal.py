@@ -1,5 +1,6 @@
 """The best policy under a limit: in expectation by linear programmes, in every episode by recursion."""
 
+import dataclasses
 from typing import NamedTuple
 
 import numpy as np
@@ -28,6 +29,11 @@ def solve(cmdp: CMDP, limit: float = np.inf) -> Solution:
     Raises ValueError, which names the least achievable cost, if no policy keeps the limit.
     """
     return _solve(cmdp.transitions, cmdp.rewards, cmdp.costs, cmdp.initial, cmdp.gamma, limit)
+
+
+def least_cost(cmdp: CMDP) -> float:
+    """The least discounted cost that any policy achieves: a limit below it is infeasible."""
+    return solve(dataclasses.replace(cmdp, rewards=-cmdp.costs)).cost
 
 
 def solve_episodes(cmdp: CMDP, horizon: int, limit: float = np.inf) -> Solution:

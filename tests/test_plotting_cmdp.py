@@ -1,0 +1,127 @@
+"""The shortcut's figures and the tasks' pictures show what they are given."""
+
+from types import SimpleNamespace
+
+import matplotlib
+import numpy as np
+import pytest
+from matplotlib.patches import Circle, Rectangle
+
+from tutorial_lib import plotting, tabular, widgets
+from tutorial_lib.tasks import get_task
+
+
+@pytest.fixture(autouse=True)
+def without_a_screen():
+    matplotlib.use("Agg")
+
+
+def arrows(ax):
+    """Lengths of the arrows, by the point where they start."""
+    found = {}
+    for text in ax.texts:
+        if getattr(text, "arrow_patch", None) is not None:
+            start, end = np.array(text.xyann), np.array(text.xy)
+            found.setdefault(tuple(np.round(start).astype(int)), []).append((end - start).round(3).tolist())
+    return found
+
+
+def labelled(ax, label):
+    (found,) = [line for line in ax.lines if line.get_label() == label]
+    return found.get_xydata()
+
+
+def test_all_eight_tasks_are_shown_with_a_ring_around_the_small_robots():
+    figure = plotting.all_tasks(size=(64, 48))
+    assert len(figure.axes) == 8 and all(len(ax.images) == 1 for ax in figure.axes)
+    pictures = [ax.images[0].get_array().tobytes() for ax in figure.axes]
+    assert len(set(pictures)) == 8
+    rings = [[patch for patch in ax.patches if isinstance(patch, Circle)] for ax in figure.axes]
+    assert [len(ring) for ring in rings] == [0] * 4 + [1] * 4
+    assert all(0 < x < 64 and 0 < y < 48 for (ring,) in rings[4:] for x, y in [ring.center])
+
+
+@pytest.mark.parametrize("name", ["BallCircle", "BallRun"])
+def test_drives_show_each_way_and_its_unsafe_steps(name):
+    way = np.stack([np.linspace(0, 9, 10), np.linspace(0, 3, 10)], 1)
+    costs = np.abs(way[:, 0]) > 6 if name == "BallCircle" else np.arange(10) % 3 == 0
+    drive = SimpleNamespace(positions=way, costs=costs.astype(float), rewards=np.ones(10))
+    figure = plotting.drives(get_task(name), {"one": drive, "two": drive})
+    titles = [f"{title}: cost {costs.sum()}, return 10" for title in ("one", "two")]
+    assert [ax.get_title() for ax in figure.axes] == titles
+    for ax in figure.axes:
+        assert labelled(ax, "the robot's way") == pytest.approx(way)
+        unsafe = [line.get_xydata() for line in ax.lines if line.get_label().startswith("unsafe")]
+        assert sorted(np.vstack(unsafe)[:, 0]) == pytest.approx(way[costs, 0])
+
+
+def test_the_trade_off_labels_its_dots():
+    (ax,) = plotting.trade_off([0, 5, 9], [1.0, 4.0, 2.0], ["a", "b", "c"], "title").axes
+    assert ax.lines[0].get_xydata().tolist() == [[0, 1], [5, 4], [9, 2]]
+    assert [(text.get_text(), *text.xy) for text in ax.texts] == [("a", 0, 1), ("b", 5, 4), ("c", 9, 2)]
+
+
+def test_the_map_counts_steps_and_hazards():
+    (ax,) = plotting.shortcut_map().axes
+    labels = [line.get_label() for line in ax.lines]
+    assert labels == [
+        "straight on: 4 steps, 3 on hazards",
+        "over: 6 steps, 1 on hazards",
+        "around: 8 steps, 0 on hazards",
+    ]
+    hazards = [patch for patch in ax.patches if isinstance(patch, Rectangle) and patch.get_hatch()]
+    assert sorted((round(p.get_x() + 0.46), round(p.get_y() + 0.46)) for p in hazards) == [
+        (1, 0), (2, 0), (2, 1), (3, 0),
+    ]  # fmt: skip
+
+
+def test_arrows_are_as_long_as_their_probability_and_only_where_the_shade_is():
+    policy = np.full((15, 4), 0.25)
+    policy[10] = 0.5, 0.49, 0.01, 0
+    policy[5] = 0, 1, 0, 0
+    shade = np.zeros(15)
+    shade[[5, 10, 14]] = 1
+    figure = plotting.shortcut_policies({"a": (policy, shade), "b": (policy, shade * 0)})
+    assert [ax.get_title() for ax in figure.axes] == ["a", "b"]
+    found = arrows(figure.axes[0])
+    assert found == {(0, 0): [[0, 0.27], [0.267, 0]], (0, 1): [[0.44, 0]]}  # none on the goal
+    assert arrows(figure.axes[1]) == {}
+
+
+def test_the_frontier_holds_the_limits_own_solution():
+    found = tabular.solve(tabular.shortcut(), 1.4)
+    figure = widgets.shortcut(1.4)
+    left, right = figure.axes
+    curve = labelled(left, "the best reward under each limit")
+    assert np.interp(1.4, *curve.T) == pytest.approx(found.reward, abs=0.01)
+    assert labelled(left, "limit")[0, 0] == 1.4
+    assert left.get_title() == f"limit 1.4: reward {found.reward:.2f}, cost 1.40"
+    start = arrows(right)[0, 0]
+    assert len(start) == 2  # up or right
+    assert start[0][1] == pytest.approx(0.1 + 0.34 * found.policy[10, 0], abs=1e-3)
+
+
+def test_a_limit_that_no_policy_keeps_is_told():
+    left, right = widgets.shortcut(0.0).axes
+    assert left.get_title() == "limit 0: no policy keeps it"
+    assert right.get_title() == f"the most timid one costs {tabular.least_cost(tabular.shortcut()):.3f}"
+    assert arrows(right) == {}
+
+
+def test_the_limits_slider_draws_anew(monkeypatch):
+    shown = []
+    monkeypatch.setattr("ipywidgets.widgets.interaction.display", shown.append)
+    control = widgets.shortcut_slider(limit=1.0)
+    control.kwargs_widgets[0].value = 0.0
+    titles = [figure.axes[0].get_title().split(":")[0] for figure in shown]
+    assert titles == ["limit 1", "limit 0"]
+    assert repr(control) == "(Run the notebook for sliders: limit.)"
+
+
+def test_bars_are_shares_split_at_the_limit():
+    figure = plotting.episode_costs({"one": np.array([0, 1, 1, 3]), "two": np.array([2, 2, 2, 2])}, 2)
+    for ax, heights, mean in zip(figure.axes, ([0.25, 0.5, 0, 0.25], [0, 0, 1, 0]), (1.25, 2), strict=True):
+        bars = sorted((bar.get_x() + bar.get_width() / 2, bar.get_height()) for bar in ax.patches)
+        assert [height for _, height in bars] == heights
+        assert len({bar.get_facecolor() for bar in ax.patches}) == 2
+        assert labelled(ax, "mean cost")[0, 0] == mean
