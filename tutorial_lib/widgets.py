@@ -60,6 +60,12 @@ def shortcut_slider(limit: float = 1.0) -> Controls:
     return Controls(shortcut, limit=limits)
 
 
+def filter_slider(dataset, task, limit: float = 30) -> Controls:
+    """`plotting.filtered` with a slider for the limit, up to the task's cost range."""
+    limits = ipywidgets.IntSlider(limit, 0, int(task.cost_range), 1, description="limit", **SLIDER)
+    return Controls(lambda limit: plotting.filtered(dataset, task, limit), limit=limits)
+
+
 def print_lines(function, first: int, last: int | None = None) -> None:
     """Prints the paragraph of a function that its comment calls lines `first` to `last` (of Algorithm 2).
 

@@ -9,4 +9,5 @@ from tutorial_lib.checks.c2iql import *
 from tutorial_lib.checks.claims import *
 from tutorial_lib.checks.cmdp import *
 from tutorial_lib.checks.discounting import *
+from tutorial_lib.checks.logs import *
 from tutorial_lib.checks.start import *

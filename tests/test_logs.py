@@ -1,0 +1,222 @@
+"""What is counted in recordings, against slow loops and a linear programme."""
+
+import matplotlib
+import numpy as np
+import pytest
+from scipy.optimize import linprog
+
+from tutorial_lib import checks, logs, plotting, widgets
+from tutorial_lib.datasets import Dataset
+from tutorial_lib.envs import make_env
+from tutorial_lib.tasks import get_task
+
+
+@pytest.fixture(autouse=True)
+def without_a_screen():
+    matplotlib.use("Agg")
+
+
+def recordings(rng, episodes=30, terminals=True):
+    """Random episodes of 1 to 9 steps; some end by a fall."""
+    lengths = rng.integers(1, 10, episodes)
+    rows = lengths.sum()
+    ends = np.zeros(rows, bool)
+    ends[np.cumsum(lengths) - 1] = True
+    fell = ends & (rng.random(rows) < 0.5 * terminals)
+    observations = rng.normal(size=(rows, 8)).astype(np.float32)
+    costs = (rng.random(rows) < 0.4).astype(np.float32)
+    rewards = rng.normal(1, 2, rows).astype(np.float32)
+    return Dataset(observations, observations + 1, observations[:, :2], rewards, costs, fell, ends & ~fell)
+
+
+def of_points(points):
+    """A dataset whose episodes, of one step, have these costs and returns."""
+    costs, returns = np.array(points, np.float32).T
+    rows, zeros = np.ones(len(points), bool), np.zeros((len(points), 8), np.float32)
+    return Dataset(zeros, zeros, zeros[:, :2], returns, costs, ~rows, rows)
+
+
+@pytest.mark.parametrize("name", ["BallRun", "CarCircle", "AntRun", "DroneCircle"])
+def test_positions_are_the_simulators(name):
+    env = make_env(name)
+    observation, _ = env.reset(seed=3)
+    before, first = env.position, observation
+    for _ in range(5):
+        last = observation
+        observation, *_ = env.step(np.full(env.task.act_dim, 0.7))
+    flag = np.ones(1, bool)
+    data = Dataset(last[None], observation[None], np.zeros((1, 2)), flag * 1.0, flag * 1.0, ~flag, flag)
+    assert logs.positions(data)[0] == pytest.approx(env.position, abs=1e-4)
+    start = Dataset(first[None], last[None], np.zeros((1, 2)), flag * 1.0, flag * 1.0, ~flag, flag)
+    assert logs.positions(start, after=False)[0] == pytest.approx(before, abs=1e-4)
+    env.close()
+
+
+def test_best_left_against_a_filter_for_each_limit():
+    data = recordings(np.random.default_rng(0))
+    limits = [0, 1, 2.5, 9]
+    shares, best = logs.best_left(data, limits)
+    for limit, share, top in zip(limits, shares, best, strict=True):
+        kept = [r for r, c in zip(data.episode_returns, data.episode_costs, strict=True) if c <= limit]
+        assert (share, top) == (len(kept) / 30, max(kept))
+
+
+def test_nothing_left_is_no_return():
+    shares, best = logs.best_left(of_points([(5, 1), (7, 2)]), [4, 5])
+    assert shares.tolist() == [0, 0.5]
+    assert np.isnan(best[0]) and best[1] == 1
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_best_mixture_is_the_linear_programmes(seed):
+    rng = np.random.default_rng(seed)
+    points = np.stack([rng.integers(0, 12, 25), rng.normal(0, 10, 25).round(seed % 3)], 1)
+    data = of_points(points)
+    limits = np.linspace(0, 14, 9)
+    for limit, found in zip(limits, logs.best_mixture(data, limits), strict=True):
+        best = linprog(
+            -data.episode_returns, A_ub=data.episode_costs[None], b_ub=[limit],
+            A_eq=np.ones((1, 25)), b_eq=[1],
+        )  # fmt: skip
+        if best.status == 2:  # nothing is that cheap
+            assert np.isnan(found)
+        else:
+            assert found == pytest.approx(-best.fun, abs=1e-6)
+
+
+def test_near_best_counts_only_what_keeps_the_limit():
+    data = of_points([(0, 100), (0, 91), (0, 89), (10, 95), (30, 500)])
+    assert logs.near_best(data, 0) == 2
+    assert logs.near_best(data, 10) == 3
+    assert logs.near_best(data, 40) == 1
+    assert logs.near_best(of_points([(5, 1)]), 4) == 0
+
+
+def test_returns_to_go_against_a_double_loop():
+    data = recordings(np.random.default_rng(1))
+    tails = np.arange(30.0)
+    found = logs.returns_to_go(data, 0.9, tails)
+    for e, (start, end) in enumerate(zip(data.starts, data.ends, strict=True)):
+        for row in range(start, end):
+            expected = sum(0.9 ** (k - row) * data.rewards[k] for k in range(row, end))
+            expected += 0 if data.terminals[end - 1] else 0.9 ** (end - row) * tails[e]
+            assert found[row] == pytest.approx(expected, abs=1e-5)
+
+
+def test_within_looks_ahead_and_not_into_the_next_episode():
+    data = recordings(np.random.default_rng(2))
+    for steps in (1, 3):
+        found = logs.within(data, steps)
+        for row in range(len(data)):
+            last = min(row + steps, data.ends[data.episode_index[row]])
+            assert found[row] == any(data.costs[row:last])
+
+
+# --- Figures, slider, exercises ---
+
+
+@pytest.fixture
+def three():
+    """Three episodes of one step at (cost, return) = (0, 10), (40, 50), (60, 20), for two tasks."""
+    data = of_points([(0, 10), (40, 50), (60, 20)])
+    return {"BallCircle": data, "BallRun": data}
+
+
+def labelled(ax, label):
+    (found, *_) = [line for line in ax.lines if line.get_label() == label]
+    return found.get_xydata()
+
+
+def test_planes_show_every_episode_threshold_and_frontier(three):
+    figure = plotting.planes(three, frontier=True)
+    assert [ax.get_title() for ax in figure.axes] == ["BallCircle", "BallRun"]
+    for ax in figure.axes:
+        assert labelled(ax, "episode").tolist() == [[0, 10], [40, 50], [60, 20]]
+        assert [line.get_xdata()[0] for line in ax.lines if line.get_label() == "threshold"] == [30, 50, 70]
+        stairs = dict(labelled(ax, "best episode left"))
+        assert (stairs[0], stairs[20], stairs[40], stairs[80]) == (10, 10, 50, 50)
+        assert dict(labelled(ax, "best mixture"))[20] == pytest.approx(30)
+        assert len(labelled(ax, "DSRL's frontier, read off its plots")) > 2
+
+
+def test_filtered_says_how_many_pass_and_how_good_the_best_is(three):
+    figure = plotting.filtered(three["BallCircle"], get_task("BallCircle"), 45)
+    plane = figure.axes[0]
+    assert plane.get_title() == "limit 45: 2 of 3 episodes pass, best 50"
+    assert labelled(plane, "passes").tolist() == [[0, 10], [40, 50]]
+    assert labelled(plane, "filtered out").tolist() == [[60, 20]]
+
+
+def test_filtered_can_leave_nothing():
+    figure = plotting.filtered(of_points([(5, 1), (9, 2)]), get_task("BallCircle"), 3)
+    assert figure.axes[0].get_title() == "limit 3: 0 of 2 episodes pass"
+
+
+def test_visited_counts_every_step_and_marks_the_cost_zone():
+    data = recordings(np.random.default_rng(3))
+    figure = plotting.visited({"CarCircle": data, "CarRun": data})
+    for ax in figure.axes[:2]:
+        assert ax.collections[0].get_array().sum() == len(data)
+    assert [line.get_xdata()[0] for line in figure.axes[0].lines] == [-6, 6]
+    assert [line.get_ydata()[0] for line in figure.axes[1].lines] == [-2, 2]
+
+
+def test_examples_left_has_a_bar_for_all_and_one_for_the_good(three):
+    (ax,) = plotting.examples_left({"BallCircle": three["BallCircle"]}).axes
+    assert [bar.get_height() for bar in ax.patches] == [1, 2, 3, 1, 1, 1]
+
+
+def test_at_the_wall_counts_and_averages_per_bin():
+    left, right = plotting.at_the_wall(np.array([-1, -0.9, 0.2, 1.0]), np.array([0, 1, 1, 1]), bins=2).axes
+    assert [bar.get_height() for bar in left.patches] == [2, 2]
+    assert [bar.get_height() for bar in right.patches] == [0.5, 1]
+
+
+def test_to_go_draws_both_lines():
+    (ax,) = plotting.to_go(np.arange(3), np.array([3, 2, 1]), np.array([4, 4, 4]), 2.0).axes
+    assert labelled(ax, "the end: nothing follows")[:, 1].tolist() == [3, 2, 1]
+    assert labelled(ax, "a cut: the robot goes on at its rate")[:, 1].tolist() == [4, 4, 4]
+
+
+def test_moving_the_slider_filters_anew(three, capsys):
+    control = widgets.filter_slider(three["BallCircle"], get_task("BallCircle"), limit=30)
+    (limit,) = control.kwargs_widgets
+    assert control.result.axes[0].get_title() == "limit 30: 1 of 3 episodes pass, best 10"
+    limit.value = 60
+    assert control.result.axes[0].get_title() == "limit 60: 3 of 3 episodes pass, best 50"
+    assert (limit.min, limit.max) == (0, 80)
+
+
+def sums(values, terminals, timeouts):
+    totals, total = [], 0.0
+    for value, *flags in zip(values, terminals, timeouts, strict=True):
+        total += value
+        if any(flags):
+            totals, total = [*totals, total], 0.0
+    return np.array(totals)
+
+
+def target(reward, gamma, next_value, terminal, timeout, bootstrap):
+    return reward + gamma * next_value * (not terminal) * (bootstrap or not timeout)
+
+
+@pytest.mark.parametrize(
+    "checker, answer, said",
+    [
+        (checks.check_episode_sums, sums, "OK  sums is right"),
+        (checks.check_episode_sums, lambda v, a, b: sums(v, a & b, a | b), "OK"),
+        (checks.check_episode_sums, lambda v, a, b: sums(v, a, a), "row that is flagged"),
+        (checks.check_episode_sums, lambda v, a, b: sums(v, b, b), "terminal ends"),
+        (checks.check_episode_sums, lambda v, a, b: np.add.reduceat(v, [0, *np.flatnonzero(a | b)[:-1] + 1]),
+         "unfinished tail"),
+        (checks.check_backup_target, target, "OK  target is right"),
+        (checks.check_backup_target, lambda r, g, v, *flags: r + g * v, "after a terminal"),
+        (checks.check_backup_target, lambda r, g, v, a, b, c: target(r, g, v, a, b, True), "stops at"),
+        (checks.check_backup_target, lambda r, g, v, a, b, c: target(r, g, v, a or b, b, c), "looks through"),
+        (checks.check_backup_target, lambda r, g, v, a, b, c: target(r, g, v, a and not b, b, c), "a fall"),
+        (checks.check_backup_target, lambda *arguments: None, "returns nothing"),
+    ],
+)  # fmt: skip
+def test_exercises_tell_the_right_answer_from_each_mistake(checker, answer, said, capsys):
+    checker(answer)
+    assert said in capsys.readouterr().out
