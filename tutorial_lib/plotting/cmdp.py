@@ -70,10 +70,12 @@ def trade_off(costs, returns, labels, words: str):
     """One dot per way of driving, by its cost and its return, joined in order and labelled."""
     figure, ax = subplots(figsize=(9, 4.6))
     ax.plot(costs, returns, "o-", color=NEUTRAL, markersize=9, linewidth=1.5, markerfacecolor=REWARD)
-    for x, y, label in zip(costs, returns, labels, strict=True):
-        ax.annotate(f"{label}", (x, y), textcoords="offset points", xytext=(9, -14))
+    falls = np.append(np.diff(returns) < 0, False)
+    falls[-1] = falls[-2]  # a label stands below its dot where the line rises, above where it falls
+    for x, y, label, above in zip(costs, returns, labels, falls, strict=True):
+        ax.annotate(f"{label}", (x, y), textcoords="offset points", xytext=(8, 6 if above else -14))
     ax.set(xlabel="cost of the episode", ylabel="return of the episode", title=words)
-    ax.margins(0.08, 0.12)
+    ax.margins(0.14, 0.12)
     return figure
 
 
