@@ -34,9 +34,6 @@ def shortcut(slip: float = 0.1, gamma: float = 0.9, layout=SHORTCUT) -> CMDP:
     return CMDP(transitions, *per_state, (cells == "S").astype(float), gamma)
 
 
-corridor = shortcut
-
-
 def random_cmdp(
     rng: np.random.Generator, states: int = 6, actions: int = 3, gamma: float = 0.9, branching: int = 3
 ) -> CMDP:
