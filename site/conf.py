@@ -1,11 +1,17 @@
-"""The course's site: the executed notebooks, and a page on the library made from its docstrings."""
+"""The course's site: the executed notebooks, and pages on the library made from its docstrings."""
 
+import json
 import pkgutil
+import re
+import sys
 from pathlib import Path
 
 from markdown_it import MarkdownIt
 
 import tutorial_lib
+
+sys.path.insert(0, str(Path(__file__).parent))
+from marks import remove_marks  # noqa: E402
 
 project = "Safe offline reinforcement learning with C2IQL"
 html_title = project
@@ -15,7 +21,10 @@ exclude_patterns = ["data", "tutorial_lib"]
 
 nb_execution_mode = "off"  # the Makefile has executed them
 nb_output_stderr = "remove"
-nb_ipywidgets_js = {}  # widgets need a running kernel, and their scripts the network
+nb_merge_streams = True
+nb_code_prompt_show = "Show a solution"  # nothing else is hidden
+nb_code_prompt_hide = "Hide it"
+nb_ipywidgets_js = {}  # sliders need a running kernel, and their scripts the network
 myst_enable_extensions = ["dollarmath", "amsmath"]
 autodoc_member_order = "bysource"
 
@@ -25,18 +34,52 @@ html_copy_source = False
 
 
 def setup(app):
-    app.connect("builder-inited", write_reference_page)
+    app.connect("builder-inited", write_reference_pages)
+    app.connect("source-read", finish_page)
     app.connect("autodoc-process-docstring", read_docstring_as_markdown)
 
 
-def write_reference_page(app):
-    """One section per module, in the order of the alphabet: a new module needs no line here."""
+def write_reference_pages(app):
+    """One page per module, in the order of the alphabet: a new module needs no line here."""
     modules = pkgutil.walk_packages(tutorial_lib.__path__, "tutorial_lib.")
-    sections = [
-        f"## {name}\n\n```{{eval-rst}}\n.. automodule:: {name}\n   :members:\n```\n"
-        for name in sorted(module.name for module in modules if not module.name.endswith("__main__"))
-    ]
-    Path(app.srcdir, "reference.md").write_text("\n".join(["# Reference", *sections]))
+    names = sorted(module.name for module in modules if not module.name.endswith("__main__"))
+    folder = Path(app.srcdir, "reference")
+    folder.mkdir(exist_ok=True)
+    for name in names:
+        page = f"# {name}\n\n```{{eval-rst}}\n.. automodule:: {name}\n   :members:\n```\n"
+        (folder / f"{name}.md").write_text(page)
+    entries = "\n".join(f"reference/{name}" for name in names)
+    words = "From the docstrings, a page per module. (B,) and the like are shapes: one value per transition."
+    toctree = f"```{{toctree}}\n:maxdepth: 1\n\n{entries}\n```\n"
+    Path(app.srcdir, "reference.md").write_text(f"# Reference\n\n{words}\n\n{toctree}")
+
+
+def finish_page(app, docname, source):
+    """A notebook loses what is for machines, and sliders their views, so that their words show.
+
+    The first page gets its table of contents.
+    """
+    if docname.startswith("notebooks/"):
+        notebook = json.loads(source[0])
+        remove_marks(notebook)
+        for cell in notebook["cells"]:
+            for output in cell.get("outputs", []):
+                output.get("data", {}).pop("application/vnd.jupyter.widget-view+json", None)
+        source[0] = json.dumps(notebook)
+    if docname == "index":
+        source[0] = source[0].replace("CONTENTS", contents(Path(app.srcdir)))
+
+
+def contents(folder: Path) -> str:
+    """A table of the notebooks: title, question and time, from the first cell of each."""
+    rows = ["| notebook | question | time |", "|---|---|---|"]
+    for path in sorted(folder.glob("notebooks/*.ipynb")):
+        text = "".join(json.loads(path.read_text())["cells"][0]["source"])
+        title = re.search(r"^# (.+)", text)[1]
+        question = " ".join(re.findall(r"^> (.+)", text, re.MULTILINE)).strip("*")
+        time = " ".join(re.search(r"\*\*Time:\*\*(.+)", text, re.DOTALL)[1].split()).rstrip(".")
+        rows.append(f"| [{title}](notebooks/{path.name}) | {question} | {time} |")
+    return "\n".join(rows)
 
 
 def read_docstring_as_markdown(app, what, name, obj, options, lines):
