@@ -1,5 +1,6 @@
 """The command line as a student types it: help, one-line errors, a tiny run from training to scores."""
 
+import contextlib
 import dataclasses
 import re
 import subprocess
@@ -71,6 +72,7 @@ def words(text):
         "fetch": ["Download DSRL's dataset", "DSRL_DATASET_DIR"],
         "train": ["Train an agent", "--threshold", "kappa_2=0.7", "{cpu,cuda}"],
         "evaluate": ["Run a trained agent in the simulator", "--thresholds", "per seed and threshold"],
+        "study": ["Run a study", "address of a dask scheduler", "--only", "steps=200"],
         "bench": ["Measure this machine", "bare simulator's speed", "--workers"],
     }.items(),
 )
@@ -126,6 +128,7 @@ def test_it_runs_as_a_module():
         (["train", "BallRun", "--algorithm", "CIQL"], "CIQL is trained for one threshold"),
         (["train", "BallRun", "--threshold", "30"], "C2IQL takes no threshold to train"),
         (["train", "BallRun", "--data", "nowhere.hdf5"], "nowhere.hdf5: no such file"),
+        (["study", "ablation"], "unknown study 'ablation': the studies are table1, ablations"),
         (["evaluate", "nowhere.safetensors"], "nowhere.safetensors: no such file: train an agent"),
     ],
 )
@@ -198,6 +201,45 @@ def test_train_and_evaluate(c2iql, data, tmp_path):
 
     status, _, err = c2iql(*train, "kappa_2=0.7")  # the folder is another run's
     assert status == 1 and "is of another run" in err.splitlines()[-1]
+
+
+@pytest.fixture
+def small_study(monkeypatch):
+    """A study of the shipped data that takes a second."""
+    from tutorial_lib import studies
+
+    grid = studies.Grid(("BallRun",), options=({"kappa_1": 0.6},), seeds=1, limits=(25.0,))
+    monkeypatch.setitem(studies.STUDIES, "quick", studies.Study("How quick?", (grid,)))
+
+
+def test_study(c2iql, tmp_path, small_study):
+    """A trial stays out of the committed results, and is found finished the second time."""
+    trial = ["study", "quick", "--runs", tmp_path, "--steps", 2, "--workers", 1, "--option", *TINY]
+    status, out, _ = c2iql(*trial, "--list")
+    waiting = r"waiting BallRun-C2IQL-kappa_1=0.6-\w{8}\n$"
+    assert status == 0 and re.search(waiting, out) and not list(tmp_path.iterdir())
+    status, out, _ = c2iql(*trial)
+    assert status == 0 and f"{tmp_path}/quick.csv: 1 of 1 cells" in out
+    results = pd.read_csv(tmp_path / "quick.csv")
+    assert set(results["threshold"]) == {25} and set(results["updates"]) == {2}
+    assert set(results["kappa_1"]) == {0.6} and len(results) == 10
+    status, out, _ = c2iql(*trial, "--list")
+    assert status == 0 and "done    BallRun-C2IQL-kappa_1=0.6" in out
+
+
+def test_a_failed_cell_is_reported_and_the_others_are_kept(c2iql, tmp_path, data, monkeypatch):
+    from tutorial_lib import engine, studies
+
+    grid = studies.Grid(("BallRun",), ("BC-All", "BC-Safe"), seeds=1)
+    monkeypatch.setitem(studies.STUDIES, "cloning", studies.Study("Who copies whom?", (grid,)))
+    monkeypatch.setattr(engine, "run_cells", lambda chosen, *_: {chosen[0].name: "DatasetError: none"})
+    monkeypatch.setattr(engine, "connect", lambda *_: contextlib.nullcontext())
+    out_file = tmp_path / "out.csv"
+    arguments = ["study", "cloning", "--data", data, "--runs", tmp_path, "--out", out_file]
+    status, out, err = c2iql(*arguments)
+    assert status == 1 and "Who copies whom?" in out and "0 of 4 cells" in out
+    assert re.search(r"FAILED BallRun-BC-All-\w{8}: DatasetError: none", out)
+    assert "1 of 4 cells failed" in err and err.count("\n") == 1 and not out_file.exists()
 
 
 def test_a_folder_that_cannot_be_written_is_one_line_of_error(c2iql, data, tmp_path):

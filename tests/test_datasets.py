@@ -549,3 +549,21 @@ def test_a_full_disk(server, tmp_path, monkeypatch):
     with refused(f"^{tmp_path}: No space left on device: make room"):
         fetch(server, tmp_path)
     assert os.listdir(tmp_path) == []
+
+
+# --- Checksum ---
+
+
+def test_a_checksum_is_of_the_values_and_not_of_the_file(arrays, tmp_path):
+    digest = hashlib.sha256()
+    for key in datasets.KEYS:
+        digest.update(arrays[key].tobytes())
+    plain = h5_file(tmp_path / "plain.hdf5", arrays)
+    packed = write_dataset(tmp_path / "packed.hdf5", Dataset(**arrays), CAR_RUN, {"seed": 4})
+    assert plain.read_bytes() != packed.read_bytes()
+    assert read_dataset(plain, CAR_RUN).checksum == read_dataset(packed, CAR_RUN).checksum
+    assert read_dataset(plain, CAR_RUN).checksum == digest.hexdigest()
+    for key in datasets.KEYS:
+        changed = arrays | {key: arrays[key].copy()}
+        changed[key][0] = 1 - changed[key][0] if changed[key].dtype != bool else ~changed[key][0]
+        assert Dataset(**changed).checksum != digest.hexdigest(), key

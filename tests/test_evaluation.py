@@ -54,6 +54,14 @@ def test_the_same_seeds_give_the_same_episodes_whatever_ran_before():
     assert not same(rollout(agent, [30, 50, 70], [7, 8, 10]), first)
 
 
+def test_some_of_the_seeds_give_their_rows_of_all():
+    agent = make_agent(seeds=(0, 4, 2))
+    whole = evaluate(agent, (60.5,), episodes=2)
+    some = evaluate(agent, (60.5,), episodes=2, seeds=(2, 0))
+    expected = whole[whole["seed"] != 4].reset_index(drop=True)
+    pd.testing.assert_frame_equal(some, expected)
+
+
 def test_more_workers_give_the_same_rows():
     agent = make_agent(seeds=(0, 4))
     alone = evaluate(agent, (60.5,), episodes=EPISODES_TOGETHER + 2, workers=1)

@@ -12,7 +12,13 @@ import torch
 from tutorial_lib import reconstruction
 from tutorial_lib.config import Config
 from tutorial_lib.datasets import Dataset
-from tutorial_lib.reconstruction import CostReconstruction, episode_sums, random_sums, train_reconstruction
+from tutorial_lib.reconstruction import (
+    CostReconstruction,
+    episode_sums,
+    random_sums,
+    reconstruction_error,
+    train_reconstruction,
+)
 from tutorial_lib.tasks import TASKS
 
 T, GAMMAS = 20, (0.8, 0.85, 0.9)
@@ -258,3 +264,27 @@ def test_a_model_loads_what_another_saved(config, dataset):
     x = torch.rand(6, 3)
     other.load_state_dict(model.state_dict())
     assert torch.equal(model(x), other(x))
+
+
+def test_the_error_of_a_model_that_always_says_the_same_by_hand(dataset):
+    """A constant guess errs by the costs' distance from it, a half each from episodes and random sequences."""
+    model = CostReconstruction(TASK, LINEAR)
+    for parameter in model.parameters():
+        parameter.data.zero_()
+    model.net.bias.data.fill_(0.25)  # of 20 steps: a cost of 5
+    _, episodes = episode_sums(dataset, TASK)
+    _, others = random_sums(TASK, 200_000, np.random.default_rng(9))
+    expected = (np.mean((episodes - 5) ** 2) / 2 + np.mean((others - 5) ** 2) / 2) ** 0.5
+    assert reconstruction_error(model, TASK, LINEAR, dataset) == pytest.approx(expected, rel=0.02)
+
+
+def test_the_error_counts_the_noise_of_the_inputs(dataset):
+    """With weights w, independent noise of standard deviation s adds s^2 |w|^2 to the mean square."""
+    model = CostReconstruction(TASK, LINEAR)
+    model.net.weight.data = torch.tensor([[3.0, -2.0, 1.0]]) / T  # the output is T times the network's
+    model.net.bias.data.zero_()
+    silent, noisy = (
+        reconstruction_error(model, TASK, dataclasses.replace(LINEAR, crm_noise=noise), dataset)
+        for noise in (0.0, 4.0)
+    )
+    assert noisy**2 - silent**2 == pytest.approx(16 * (9 + 4 + 1), rel=0.15)

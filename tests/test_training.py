@@ -218,6 +218,17 @@ def test_the_log_has_a_row_for_every_run_every_so_often_and_the_file_is_the_log(
     assert {"value_loss", "critic_loss", "policy_loss"} < log[0].keys()
 
 
+def test_a_run_does_not_go_on_with_other_data(dataset, tmp_path):
+    train(make_agent(), dataset, steps=2, run_dir=tmp_path, progress=False)
+    other = dataclasses.replace(dataset, rewards=dataset.rewards + 1)
+    with pytest.raises(TrainingError, match="was trained on other data: choose another folder"):
+        train(make_agent(), other, run_dir=tmp_path, progress=False)
+    agent = load_agent(tmp_path / "checkpoint.safetensors")
+    assert agent.data_checksum == dataset.checksum
+    save_agent(agent, tmp_path / "agent.safetensors")
+    assert load_agent(tmp_path / "agent.safetensors").data_checksum == dataset.checksum
+
+
 # --- Several seeds at once ---
 
 

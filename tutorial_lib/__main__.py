@@ -1,4 +1,4 @@
-"""The command line: `c2iql tasks | collect | fetch | train | evaluate | bench | report`.
+"""The command line: `c2iql tasks | collect | fetch | train | evaluate | study | bench | report`.
 
 tyro turns functions and dataclasses into commands with help and types, so no option is written twice.
 """
@@ -138,6 +138,62 @@ def evaluate(
     print(f"{out}: {len(results)} episodes")
 
 
+def study(
+    name: Positional[str],
+    only: str = "*",
+    scheduler: str | None = None,
+    workers: int | None = None,
+    steps: int | None = None,
+    profile: str = "small",
+    option: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE")] = (),
+    data: str = "shipped",
+    runs: Path = Path("runs/studies"),
+    out: Path | None = None,
+    dry: Annotated[bool, tyro.conf.arg(name="list")] = False,
+) -> None:
+    """Run a study, a grid of training runs and their episodes, and gather its results in one CSV.
+
+    Cells that are finished are skipped, and those that were killed go on from their last checkpoint. Equal
+    agents that are shipped, or that another study trained, are not trained again.
+
+    Args:
+        name: which study, e.g. ablations; a wrong one prints the list.
+        only: run only the cells whose name has this in it, a pattern such as CarCircle*CIQL.
+        scheduler: address of a dask scheduler; default one process for each core of this machine.
+        workers: processes on this machine.
+        steps: updates of every run, for a trial.
+        profile: of every run.
+        option: changes to every run, e.g. steps=200 crm_steps=100.
+        data: shipped, or dsrl.
+        runs: folder of all studies' runs.
+        out: the CSV to write; default data/results/NAME.csv, and in a trial runs/studies/NAME.csv.
+        dry: only list the cells, and which of them are finished.
+    """
+    from tutorial_lib import cells, engine, studies  # pulls in dask
+
+    record, folder = studies.get_study(name), runs / name
+    changes = (*option, *(() if steps is None else (f"steps={steps}",)))
+    settings = {"change": lambda config: with_options(config, changes), "profile": profile, "data": data}
+    grid, chosen = studies.cells(record, **settings), studies.cells(record, only, **settings)
+    trial = bool(changes) or profile != "small" or data != "shipped"
+    out = out or (runs / f"{name}.csv" if trial else studies.RESULTS / f"{name}.csv")
+    print(record.question)
+    if dry:
+        for cell in chosen:
+            print("done   " if cells.results_path(cell, folder).exists() else "waiting", cell.name)
+        return
+    with engine.connect(scheduler, workers) as client:
+        failures = engine.run_cells(chosen, folder, client)
+    done = cells.collect(grid, folder, out)
+    print(f"{out}: {done} of {len(grid)} cells")
+    for cell, reason in failures.items():
+        print(f"FAILED {cell}: {reason}")
+    if failures:
+        raise ValueError(
+            f"{len(failures)} of {len(chosen)} cells failed; run the study again to try them again"
+        )
+
+
 def bench(
     task: str = "BallCircle", workers: int | None = None, rounds: int = 3, device: Device = "cpu"
 ) -> None:
@@ -199,7 +255,7 @@ def check_device(device: Device) -> Device:
 
 def main() -> None:
     """Entry point: errors that a user can mend are one line, without a traceback."""
-    commands = {f.__name__: f for f in (tasks, collect, fetch, train, evaluate, bench, report)}
+    commands = {f.__name__: f for f in (tasks, collect, fetch, train, evaluate, study, bench, report)}
     try:
         tyro.extras.subcommand_cli_from_dict(
             commands, prog="c2iql", description="Safe offline RL with C2IQL."

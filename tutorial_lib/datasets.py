@@ -106,6 +106,14 @@ class Dataset:
         """(N,): the episode of each row."""
         return np.repeat(np.arange(self.num_episodes), self.episode_lengths)
 
+    @cached_property
+    def checksum(self) -> str:
+        """SHA-256 of all values, in hexadecimal: the same for the same data, however a file packs them."""
+        digest = hashlib.sha256()
+        for key in KEYS:
+            digest.update(np.ascontiguousarray(getattr(self, key)))
+        return digest.hexdigest()
+
     def select(self, episodes) -> "Dataset":
         """These episodes alone, a mask or indices in the order wanted: `d.select(d.episode_costs < 30)`."""
         chosen = np.arange(self.num_episodes)[episodes]
@@ -290,6 +298,11 @@ def find_dataset(task: Task | str, source: Path | str = "shipped") -> Path:
     if not path.is_file():
         raise DatasetError(f"{path}: {remedy}")
     return path
+
+
+def shipped_tasks() -> list[str]:
+    """The tasks whose dataset is in `data/`."""
+    return [name for name in TASKS if (SHIPPED_DATA / f"{name}.hdf5").exists()]
 
 
 def dsrl_directory() -> Path:

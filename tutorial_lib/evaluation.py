@@ -80,17 +80,19 @@ def rollout(agent: Agent, limits, seeds, run: int = 0) -> Rollout:
     return Rollout(rewards, costs, conditions, positions, lengths, predicted)
 
 
-def evaluate(agent: Agent, thresholds=None, episodes: int = 10, workers: int = 1) -> pd.DataFrame:
+def evaluate(agent: Agent, thresholds=None, episodes: int = 10, workers: int = 1, seeds=None) -> pd.DataFrame:
     """Raw results: one row per run, threshold and episode, by default under the task's three thresholds.
 
     The episodes of a seed start alike under every threshold. More workers give the same rows, sooner.
+    `seeds`: only these of the agent's runs.
     """
     thresholds = agent.task.thresholds if thresholds is None else thresholds
     if agent.threshold is not None:
         thresholds = [agent.threshold]
     jobs = [
         (run, threshold, range(first, min(first + EPISODES_TOGETHER, episodes)))
-        for run in range(len(agent.seeds))
+        for run, seed in enumerate(agent.seeds)
+        if seeds is None or seed in seeds
         for threshold in thresholds
         for first in range(0, episodes, EPISODES_TOGETHER)
     ]

@@ -108,3 +108,21 @@ def train_reconstruction(
         optimiser.step()
         schedule.step()
     return model.requires_grad_(False)
+
+
+def reconstruction_error(
+    model: CostReconstruction, task: Task, config: Config, dataset: Dataset, seed: int = 1
+) -> float:
+    """Root of the mean squared error, in cost, on the noise that the model was trained for.
+
+    Episodes of the dataset and 10,000 new random sequences count for a half each, as in training.
+    """
+    rng, generator = np.random.default_rng(seed), torch.Generator().manual_seed(seed)
+    noise = input_noise(task, config).float()
+    errors = []
+    for x, y in (episode_sums(dataset, task), random_sums(task, 10_000, rng)):
+        noisy = torch.as_tensor(x).float() + noise * torch.randn(x.shape, generator=generator)
+        with torch.no_grad():
+            found = model(noisy.to(model.mean)).cpu()
+        errors.append((found - torch.as_tensor(y).float()).square().mean().item())
+    return float(np.mean(errors)) ** 0.5

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pandas as pd
 
-from tutorial_lib.datasets import SHIPPED_DATA, load_dataset
+from tutorial_lib.datasets import SHIPPED_DATA, load_dataset, shipped_tasks
 from tutorial_lib.evaluation import summarise, with_scores
-from tutorial_lib.tasks import TASKS, get_task
+from tutorial_lib.tasks import get_task
 
 ROOT = SHIPPED_DATA.parent
 FIRST_LIGHT = SHIPPED_DATA / "results" / "first-light.csv"
@@ -36,11 +36,6 @@ DSRL_FRONTIER = {
     "CarCircle": {0: 430, 30: 480, 100: 530},
 }
 """The best returns in DSRL's data at some costs, read off its published plots."""
-
-
-def shipped_tasks() -> list[str]:
-    """The tasks whose dataset is in `data/`."""
-    return [name for name in TASKS if (SHIPPED_DATA / f"{name}.hdf5").exists()]
 
 
 def datasheet() -> str:

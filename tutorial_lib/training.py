@@ -46,6 +46,7 @@ def train(
     """
     steps = agent.config.steps if steps is None else steps
     generators = [torch.Generator().manual_seed(seed) for seed in agent.seeds]
+    agent.data_checksum = dataset.checksum
     log = _resume(agent, generators, run_dir) if run_dir and (run_dir / CHECKPOINT).exists() else []
     dataset = agent.select_episodes(dataset)
     if not agent.updates:
@@ -145,6 +146,7 @@ def _save(agent: Agent, path: Path, tensors: dict[str, torch.Tensor]) -> None:
         "config": json.dumps(asdict(agent.config)),
         "seeds": json.dumps(agent.seeds),
         "threshold": json.dumps(agent.threshold),
+        "data": json.dumps(agent.data_checksum),
     }
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_suffix(".tmp")
@@ -167,6 +169,7 @@ def load_agent(path: Path | str, device="cpu") -> Agent:
             device=device,
         )
         agent.load_state(tensors)
+        agent.data_checksum = json.loads(header.get("data", "null"))
     except FileNotFoundError:
         raise TrainingError(f"{path}: no such file: train an agent with `c2iql train`") from None
     except (OSError, SafetensorError, KeyError, TypeError, ValueError, RuntimeError) as error:
@@ -199,6 +202,8 @@ def _resume(agent: Agent, generators: list[torch.Generator], run_dir: Path) -> l
         raise TrainingError(
             f"{path}: is of another run (task, algorithm, options or seeds): choose another folder"
         )
+    if saved.data_checksum not in (None, agent.data_checksum):
+        raise TrainingError(f"{path}: was trained on other data: choose another folder")
     try:
         with safe_open(path, "pt") as file:
             agent.load_state({key: file.get_tensor(key) for key in file.keys()})  # noqa: SIM118

@@ -75,6 +75,7 @@ class Agent:
             fused=True,
         )
         self.updates = 0
+        self.data_checksum: str | None = None  # of the dataset that it was trained on
 
     # What a subclass writes -------------------------------------------------------------------------
 

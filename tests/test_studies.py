@@ -1,0 +1,266 @@
+"""Studies: which cells a grid has, how a cell is named, run, reused and gathered; two workers, one killed."""
+
+import dataclasses
+import os
+import signal
+import threading
+import time
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from tutorial_lib import cells as cells_module
+from tutorial_lib import engine, studies, training
+from tutorial_lib.cells import collect, find_trained, results_path, run_cell
+from tutorial_lib.config import PROFILES, Config
+from tutorial_lib.datasets import Dataset, read_dataset, write_dataset
+from tutorial_lib.evaluation import evaluate
+from tutorial_lib.studies import Grid, Study
+
+TINY = {
+    "hidden_width": 8,
+    "hidden_layers": 1,
+    "batch_size": 8,
+    "crm_width": 8,
+    "crm_layers": 1,
+    "crm_steps": 5,
+}
+COLUMNS = ["task", "algorithm", "profile", "seed", "threshold", "episode", "return", "cost", "length"] + [
+    "predicted_cost",
+    "updates",
+]
+
+
+def make_file(path, seed=0, task="BallRun", columns=7):
+    """Three random episodes of 100 steps; none costs less than 31."""
+    rng = np.random.default_rng(seed)
+    dataset = Dataset(
+        observations=rng.normal(size=(300, columns)).astype(np.float32),
+        next_observations=rng.normal(size=(300, columns)).astype(np.float32),
+        actions=rng.uniform(-1, 1, size=(300, 2)).astype(np.float32),
+        rewards=rng.normal(5, 5, size=300).astype(np.float32),
+        costs=np.tile(np.arange(100) < 45, 3).astype(np.float32),
+        terminals=np.zeros(300, bool),
+        timeouts=np.arange(1, 301) % 100 == 0,
+    )
+    return str(write_dataset(path, dataset, task))
+
+
+@pytest.fixture
+def data(tmp_path):
+    return make_file(tmp_path / "data.hdf5")
+
+
+def tiny(config, **changes):
+    return dataclasses.replace(config, **({"steps": 4} | TINY | changes))
+
+
+def make_cells(grid, data, **options):
+    episodes = options.pop("episodes", 1)
+    chosen = studies.cells(Study("?", (grid,)), change=tiny, data=data, **options)
+    return [dataclasses.replace(cell, episodes=episodes) for cell in chosen]
+
+
+# --- The table ---
+
+
+def test_a_grid_has_every_combination_and_a_threshold_where_one_is_needed(data):
+    grid = Grid(("BallRun",), ("C2IQL", "CIQL"), ({"kappa_1": 0.5}, {"kappa_1": 0.7}), seeds=2)
+    chosen = make_cells(grid, data)
+    found = {(cell.algorithm, cell.config.kappa_1, cell.threshold) for cell in chosen}
+    limits = (30, 50, 70)
+    assert found == {("C2IQL", k, None) for k in (0.5, 0.7)} | {
+        ("CIQL", k, limit) for k in (0.5, 0.7) for limit in limits
+    }
+    assert len(chosen) == 8 and all(cell.seeds == (0, 1) for cell in chosen)
+    assert all(cell.config.hidden_width == 8 for cell in chosen)
+
+
+def test_a_name_changes_with_whatever_changes_the_numbers(data, tmp_path):
+    (cell,) = make_cells(Grid(("BallRun",)), data)
+    other = read_dataset(make_file(tmp_path / "other.hdf5", seed=1), "BallRun").checksum
+    changes = {
+        "config": dataclasses.replace(cell.config, kappa_1=0.55),
+        "seeds": (0, 1),
+        "limits": (25.0,),
+        "at_test": ({"infinite_at_test": "never"},),
+        "checksum": other,
+        "episodes": 2,
+        "columns": ("kappa_1",),
+        "threshold": 3.0,
+    }
+    names = {dataclasses.replace(cell, **{key: value}).name for key, value in changes.items()}
+    assert len(names | {cell.name}) == len(changes) + 1
+    assert dataclasses.replace(cell, data="elsewhere.hdf5").name == cell.name
+    assert not set("/ ") & set("".join(names))
+
+
+def test_only_chooses_by_name_and_nothing_left_is_an_error(data):
+    grid = Grid(("BallRun",), ("C2IQL w/o CC", "CIQL", "C2IQL"))
+    assert {cell.algorithm for cell in make_cells(grid, data, only="-CIQL")} == {"CIQL"}
+    assert [cell.threshold for cell in make_cells(grid, data, only="wo-CC*50")] == [50]
+    with pytest.raises(ValueError, match="no cell fits 'Hopper': the cells are BallRun-C2IQL-wo-CC-30"):
+        make_cells(grid, data, only="Hopper")
+
+
+def test_the_named_studies_are_made_of_known_options_algorithms_and_tasks():
+    fields = {field.name for field in dataclasses.fields(Config)}
+    for name, study in studies.STUDIES.items():
+        assert set(studies.varied_options(study)) <= fields
+        found = studies.cells(study)
+        assert len({cell.name for cell in found}) == len(found) > 0, name
+        for grid in study.grids:
+            assert all(set(options) <= set(cells_module.AT_TEST) for options in grid.at_test)
+            assert not any(set(options) & set(cells_module.AT_TEST) for options in grid.options)
+        for cell in found:
+            assert cell.build().name == cell.algorithm
+    with pytest.raises(ValueError, match="unknown study 'ablation': the studies are table1"):
+        studies.get_study("ablation")
+
+
+def test_the_studies_that_the_paper_has_are_the_papers():
+    kappas = {(c.config.kappa_1, c.config.kappa_2) for c in studies.cells(studies.STUDIES["kappas"])}
+    assert kappas == {(a, b) for a in (0.5, 0.7, 0.9) for b in (0.5, 0.7, 0.9)}
+    noise = studies.cells(studies.STUDIES["crm-noise"])
+    assert sorted(c.config.crm_noise for c in noise) == [0, 0.1, 0.2, 0.3, 0.5, 1, 2, 4]
+    ablations = studies.cells(studies.STUDIES["ablations"], "CarCircle")
+    assert sorted((c.algorithm, c.threshold or 0) for c in ablations) == sorted(
+        [("C2IQL", 0), ("C2IQL w/o CR", 0)]
+        + [(name, limit) for name in ("C2IQL w/o CC", "CIQL") for limit in (30, 50, 70)]
+    )
+
+
+# --- One cell ---
+
+
+def test_a_cells_results_are_those_of_training_and_evaluating_by_hand(data, tmp_path):
+    grid = Grid(("BallRun",), options=({"kappa_1": 0.55},), seeds=2, limits=(25.0,))
+    (cell,) = make_cells(grid, data, episodes=2)
+    heard = []
+    results = pd.read_csv(run_cell(cell, tmp_path / "runs" / "study", heard.append))
+    assert list(results.columns) == [*COLUMNS, "kappa_1"] and set(results["kappa_1"]) == {0.55}
+    agent = cell.build()
+    training.train(agent, read_dataset(data, "BallRun"), progress=False)
+    expected = evaluate(agent, [25.0], 2)
+    pd.testing.assert_frame_equal(results[COLUMNS], expected, check_dtype=False, rtol=1e-4)
+    assert heard == [4] and agent.config.kappa_1 == 0.55
+
+
+def test_variants_of_the_test_share_one_agent(data, tmp_path):
+    rules = tuple({"infinite_at_test": rule} for rule in ("covered", "never"))
+    (cell,) = make_cells(Grid(("BallRun",), at_test=rules, seeds=1), data)
+    results = pd.read_csv(run_cell(cell, tmp_path / "runs" / "study"))
+    assert results["infinite_at_test"].tolist() == ["covered"] * 3 + ["never"] * 3
+    assert len(list((tmp_path / "runs").glob("*/*/agent.safetensors"))) == 1
+
+
+def test_an_equal_run_is_not_trained_again(data, tmp_path, monkeypatch):
+    """Not for another study, not for fewer seeds, not for another rule at test time."""
+    (first,) = make_cells(Grid(("BallRun",), seeds=3), data)
+    (fewer,) = make_cells(Grid(("BallRun",), seeds=2, limits=(40.0,)), data)
+    rules = ({"infinite_at_test": "never"},)
+    (other_rule,) = make_cells(Grid(("BallRun",), at_test=rules, seeds=1), data)
+    whole = pd.read_csv(run_cell(first, tmp_path / "runs" / "a"))
+
+    def no_training(*args, **options):
+        raise AssertionError("it trains")
+
+    monkeypatch.setattr(training, "train", no_training)
+    results = pd.read_csv(run_cell(fewer, tmp_path / "runs" / "b"))
+    assert results[["seed", "threshold"]].values.tolist() == [[0, 40], [1, 40]]
+    assert set(pd.read_csv(run_cell(other_rule, tmp_path / "runs" / "b"))["seed"]) == {0}
+    same = pd.read_csv(run_cell(dataclasses.replace(first, label="again"), tmp_path / "runs" / "b"))
+    pd.testing.assert_frame_equal(same, whole)
+    for change in (
+        {"seeds": (0, 9)},
+        {"config": dataclasses.replace(first.config, kappa_2=0.5)},
+        {"checksum": "0" * 64},
+        {"algorithm": "CIQL", "threshold": 30.0},
+        {"config": dataclasses.replace(first.config, steps=5)},
+    ):
+        assert find_trained(dataclasses.replace(first, **change), tmp_path / "runs" / "b") is None, change
+    with pytest.raises(AssertionError, match="it trains"):
+        run_cell(dataclasses.replace(first, seeds=(0, 9)), tmp_path / "runs" / "b")
+
+
+def test_an_agent_that_stopped_early_is_not_taken_for_a_finished_one(data, tmp_path):
+    (cell,) = make_cells(Grid(("BallRun",), seeds=1), data)
+    agent = cell.build()
+    training.train(agent, read_dataset(data, "BallRun"), steps=2, progress=False)
+    training.save_agent(agent, tmp_path / "runs" / "a" / "x" / "agent.safetensors")
+    (tmp_path / "runs" / "a" / "y").mkdir()
+    (tmp_path / "runs" / "a" / "y" / "agent.safetensors").write_bytes(b"half a file")
+    assert find_trained(cell, tmp_path / "runs" / "b") is None
+
+
+def test_another_dataset_under_the_same_name_is_refused(data, tmp_path):
+    (cell,) = make_cells(Grid(("BallRun",), seeds=1), data)
+    make_file(data, seed=5)
+    with pytest.raises(ValueError, match="another checksum"):
+        run_cell(cell, tmp_path / "runs" / "a")
+
+
+# --- Many ---
+
+
+@pytest.fixture(scope="module")
+def client():
+    with engine.connect(workers=2) as client:
+        yield client
+
+
+def test_two_workers_do_what_one_process_does_and_a_failure_spoils_only_its_own_cell(data, tmp_path, client):
+    grid = Grid(("BallRun",), ("IQL", "C2IQL", "BC-Safe"), seeds=2)
+    chosen = make_cells(grid, data)  # BC-Safe has no episode to learn from at 30
+    folder = tmp_path / "runs" / "study"
+    failures = engine.run_cells(chosen, folder, client, progress=False)
+    (failed,) = failures
+    assert failed.startswith("BallRun-BC-Safe-30-")
+    assert failures[failed].startswith("DatasetError: BC-Safe: no episode costs at most 30")
+    assert collect(chosen, folder, tmp_path / "all.csv") == len(chosen) - 1 == 4
+
+    alone = tmp_path / "elsewhere" / "study"
+    for cell in chosen:
+        if cell.name != failed:
+            expected = run_cell(cell, alone).read_text()
+            assert results_path(cell, folder).read_text() == expected
+    rows = pd.read_csv(tmp_path / "all.csv")
+    assert len(rows) == 2 * (3 + 3 + 1 + 1) and list(rows.columns) == COLUMNS
+
+    times = {path: path.stat().st_mtime_ns for path in folder.rglob("*") if path.is_file()}
+    assert engine.run_cells(chosen, folder, client, progress=False).keys() == {failed}
+    assert {path: path.stat().st_mtime_ns for path in times} == times  # finished cells are skipped
+
+
+def test_a_killed_worker_loses_no_cell_and_changes_no_number(data, tmp_path, client):
+    """It is killed in the middle of a training run, after a checkpoint; another worker goes on from there."""
+    chosen = make_cells(Grid(("BallRun",), ("BC-All",), ({"kappa_1": 0.6}, {"kappa_1": 0.7}), seeds=1), data)
+    chosen[0] = dataclasses.replace(chosen[0], config=dataclasses.replace(chosen[0].config, steps=2_500))
+    folder, outcome = tmp_path / "runs" / "study", {}
+    runner = threading.Thread(
+        target=lambda: outcome.update(engine.run_cells(chosen, folder, client, progress=False))
+    )
+    pids = client.run(os.getpid)
+    runner.start()
+    checkpoint = folder / chosen[0].name / training.CHECKPOINT
+    victim = None
+    while runner.is_alive() and not victim:
+        time.sleep(0.02)
+        if checkpoint.exists():
+            victim = next((w for w, keys in client.processing().items() if chosen[0].name in keys), None)
+    assert victim and not results_path(chosen[0], folder).exists()
+    os.kill(pids[victim], signal.SIGKILL)
+    runner.join()
+    assert outcome == {}
+    updates = pd.read_csv(folder / chosen[0].name / training.METRICS)["update"]
+    assert updates.tolist() == list(range(250, 2_501, 250))  # no update twice, none left out
+    assert pids[victim] not in client.run(os.getpid).values()
+    alone = run_cell(chosen[0], tmp_path / "elsewhere" / "study")
+    assert results_path(chosen[0], folder).read_text() == alone.read_text()
+
+
+def test_agents_of_the_small_profile_that_are_shipped_would_be_found():
+    """They are an equal run of the study table1 if their data and recipe are today's."""
+    for cell in studies.cells(studies.STUDIES["table1"], "C2IQL"):
+        assert cell.config == PROFILES["small"] and cell.threshold is None

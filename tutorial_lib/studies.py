@@ -1,0 +1,163 @@
+"""Studies: grids of training runs as a table. `c2iql study NAME` runs one, on any number of cores.
+
+What a cell of the grid is stands in `cells`, how cells are spread over processes in `engine`.
+"""
+
+import dataclasses
+import fnmatch
+import functools
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from tutorial_lib.algorithms import ALGORITHMS, get_algorithm
+from tutorial_lib.cells import Cell
+from tutorial_lib.config import Config, get_profile
+from tutorial_lib.datasets import SHIPPED_DATA, find_dataset, load_dataset, shipped_tasks
+from tutorial_lib.tasks import get_task
+
+RESULTS = SHIPPED_DATA / "results"
+
+
+@dataclass(frozen=True)
+class Grid:
+    """All combinations of its tasks, algorithms and options; algorithms that need a threshold get each."""
+
+    tasks: tuple[str, ...] = ("CarCircle",)
+    algorithms: tuple[str, ...] = ("C2IQL",)
+    options: tuple[dict, ...] = ({},)
+    """Changes to the profile, one agent each."""
+    at_test: tuple[dict, ...] = ({},)
+    """Changes to the profile that only acting looks at: every agent plays under each."""
+    seeds: int = 3
+    limits: tuple[float, ...] | None = None
+    """What conditioned agents are told when they play; None: the task's three thresholds."""
+
+
+@dataclass(frozen=True)
+class Study:
+    """A question, and the grids that answer it."""
+
+    question: str
+    grids: tuple[Grid, ...]
+
+
+KAPPAS = (0.5, 0.7, 0.9)
+NOISES = (0.0, 0.1, 0.2, 0.3, 0.5, 1.0, 2.0, 4.0)
+SIZES = ({"crm": "linear"}, {"crm_width": 16, "crm_layers": 1}, {"crm_width": 64}, {"crm_width": 256}) + (
+    {"crm_width": 512, "crm_layers": 5},
+)
+CIRCLES = ("CarCircle", "BallCircle", "DroneCircle")
+PAIR = ("BallRun", "CarCircle")  # the shortest horizon and the longest: gamma^T is 0.01 and 0.05
+
+STUDIES: dict[str, Study] = {
+    "table1": Study(
+        "The paper's Table 1: how much reward at how much cost, on every task whose data is shipped?",
+        (
+            Grid(tuple(shipped_tasks()), ("C2IQL", "BC-All", "BC-Safe"), seeds=5),
+            Grid(tuple(shipped_tasks()), tuple(name for name in ("CPQ",) if name in ALGORITHMS)),
+        ),
+    ),
+    "ablations": Study(
+        "Figures 3 and 7: what do cost reconstruction and constraint conditioning each add?",
+        (Grid(CIRCLES, ("C2IQL", "C2IQL w/o CR", "C2IQL w/o CC", "CIQL")),),
+    ),
+    "kappas": Study(
+        "Figure 4: what do the two expectiles do? Costs are evaluated for kappa_1, as Algorithm 2 has it.",
+        (
+            Grid(
+                options=tuple(
+                    {"kappa_1": k1, "kappa_2": k2, "cost_kappa": None}
+                    for k1, k2 in itertools.product(KAPPAS, KAPPAS)
+                )
+            ),
+        ),
+    ),
+    "crm-noise": Study(
+        "Table 2: how much noise should the reconstruction model be trained with?",
+        (Grid(options=tuple({"crm_noise": noise, "crm_noise_rate": 0.0} for noise in NOISES)),),
+    ),
+    "crm-size": Study("How large must the reconstruction model be?", (Grid(options=SIZES),)),
+    "time-limits": Study(
+        "What should a time limit mean to the cost critics?",
+        (Grid(PAIR, options=tuple({"time_limits": kind} for kind in ("rate", "bootstrap", "mask"))),),
+    ),
+    "thresholds-per": Study(
+        "One threshold per sample, or one per batch?",
+        (Grid(PAIR, options=({"thresholds_per": "sample"}, {"thresholds_per": "batch"})),),
+    ),
+    "infinite-at-test": Study(
+        "When should the policy be told that nothing limits it any more?",
+        (
+            Grid(
+                ("BallRun", "BallCircle", "CarCircle"),
+                at_test=tuple({"infinite_at_test": rule} for rule in ("covered", "nearest", "never")),
+            ),
+        ),
+    ),
+    "unseen-limits": Study(
+        "Does the agent keep limits that it was never trained on?", (Grid(limits=(25.0, 40.0, 60.0)),)
+    ),
+}
+
+
+def get_study(name: str) -> Study:
+    """The study called `name`, or ValueError that lists those there are."""
+    if name not in STUDIES:
+        raise ValueError(f"unknown study {name!r}: the studies are {', '.join(STUDIES)}")
+    return STUDIES[name]
+
+
+def varied_options(study: Study) -> tuple[str, ...]:
+    """The options that differ between the study's cells: columns of its results."""
+    changes = [options for grid in study.grids for options in (*grid.options, *grid.at_test)]
+    return tuple(dict.fromkeys(name for options in changes for name in options))
+
+
+def cells(
+    study: Study,
+    only: str = "*",
+    change: Callable[[Config], Config] = lambda config: config,
+    profile: str = "small",
+    data: str = "shipped",
+) -> list[Cell]:
+    """The study's cells whose name fits the pattern `only` (as of file names, anywhere in it).
+
+    `change` is applied to every configuration last. Tasks without a dataset are left out where it is the
+    shipped one. Raises ValueError where nothing is left.
+    """
+    columns, made = varied_options(study), {}
+    for grid in study.grids:
+        tasks = [task for task in grid.tasks if data != "shipped" or task in shipped_tasks()]
+        for task, algorithm, options in itertools.product(tasks, grid.algorithms, grid.options):
+            path = find_dataset(task, data)
+            checksum = _checksum(task, path, path.stat().st_mtime_ns)
+            kind = get_algorithm(algorithm)
+            fixed = kind.constrained and not kind.conditioned
+            config = change(dataclasses.replace(get_profile(profile), **options))
+            for threshold in get_task(task).thresholds if fixed else (None,):
+                cell = Cell(
+                    task=task,
+                    algorithm=algorithm,
+                    config=config,
+                    threshold=threshold,
+                    seeds=tuple(range(grid.seeds)),
+                    limits=grid.limits,
+                    at_test=grid.at_test,
+                    label=",".join(f"{name}={value}" for name, value in options.items()),
+                    columns=columns,
+                    checksum=checksum,
+                    data=data,
+                )
+                made[cell.name] = cell
+    chosen = [cell for name, cell in made.items() if fnmatch.fnmatchcase(name, f"*{only}*")]
+    if not chosen:
+        raise ValueError(f"no cell fits {only!r}: the cells are {', '.join(made) or 'none, without data'}")
+    return chosen
+
+
+@functools.lru_cache
+def _checksum(task: str, path: Path, changed: int) -> str:
+    """Of a dataset, read once for as long as its file does not change."""
+    return load_dataset(task, path).checksum
