@@ -267,7 +267,7 @@ def test_a_model_loads_what_another_saved(config, dataset):
 
 
 def test_the_error_of_a_model_that_always_says_the_same_by_hand(dataset):
-    """A constant guess errs by the costs' distance from it, a half each from episodes and random sequences."""
+    """A constant errs by the costs' distance from it; episodes and random sequences count for a half each."""
     model = CostReconstruction(TASK, LINEAR)
     for parameter in model.parameters():
         parameter.data.zero_()
