@@ -66,6 +66,15 @@ def filter_slider(dataset, task, limit: float = 30) -> Controls:
     return Controls(lambda limit: plotting.filtered(dataset, task, limit), limit=limits)
 
 
+def head_error_slider(models, task, head: int = 2, error: float = 0.0) -> Controls:
+    """`plotting.head_error` with a slider for the head that errs and one for its error."""
+    heads = ipywidgets.IntSlider(head, 1, len(task.gammas), description="head", **SLIDER)
+    errors = ipywidgets.FloatSlider(error, min=-2, max=2, step=0.05, description="error", **SLIDER)
+    return Controls(
+        lambda head, error: plotting.head_error(models, task, head, error), head=heads, error=errors
+    )
+
+
 def print_lines(function, first: int, last: int | None = None) -> None:
     """Prints the paragraph of a function that its comment calls lines `first` to `last` (of Algorithm 2).
 

@@ -10,4 +10,5 @@ from tutorial_lib.checks.claims import *
 from tutorial_lib.checks.cmdp import *
 from tutorial_lib.checks.discounting import *
 from tutorial_lib.checks.logs import *
+from tutorial_lib.checks.reconstruction import *
 from tutorial_lib.checks.start import *
