@@ -72,6 +72,7 @@ def words(text):
         "fetch": ["Download DSRL's dataset", "DSRL_DATASET_DIR"],
         "train": ["Train an agent", "--threshold", "kappa_2=0.7", "{cpu,cuda}"],
         "evaluate": ["Run a trained agent in the simulator", "--thresholds", "per seed and threshold"],
+        "report": ["Make tables and figures from the results' files", "whose table is printed"],
         "study": ["Run a study", "address of a dask scheduler", "--only", "steps=200"],
         "bench": ["Measure this machine", "bare simulator's speed", "--workers"],
     }.items(),
@@ -210,6 +211,16 @@ def small_study(monkeypatch):
 
     grid = studies.Grid(("BallRun",), options=({"kappa_1": 0.6},), seeds=1, limits=(25.0,))
     monkeypatch.setitem(studies.STUDIES, "quick", studies.Study("How quick?", (grid,)))
+
+
+def test_report_of_a_study_says_that_it_was_not_run(c2iql, monkeypatch):
+    from tutorial_lib import report, results
+
+    monkeypatch.setattr(report, "load_results", lambda name: results.load_results("no-such-study"))
+    status, out, _ = c2iql("report", "kappas")
+    assert status == 0 and "Not run: `c2iql study kappas` makes it." in out and "no figure" in out
+    status, _, err = c2iql("report", "kappa")
+    assert status == 1 and "unknown study 'kappa': the studies are table1" in err
 
 
 def test_study(c2iql, tmp_path, small_study):

@@ -6,6 +6,7 @@ import pytest
 
 from tutorial_lib import report
 from tutorial_lib.datasets import load_dataset
+from tutorial_lib.results import load_results
 from tutorial_lib.tasks import get_task
 
 
@@ -30,15 +31,14 @@ def test_every_shipped_dataset_reaches_nine_tenths_of_dsrls_frontier():
             assert best >= 0.9 * dsrl, (name, cost)
 
 
-def test_results_table_by_hand(tmp_path):
+def test_results_table_by_hand():
     same = {"task": "CarRun", "algorithm": "C2IQL", "profile": "small"}
     rows = [
         same | {"seed": seed, "threshold": limit, "return": r, "cost": c}
         for limit, r, c in ((10, 204.2873, 5), (20, 574.6533, 20), (40, 574.6533, 0))
         for seed in (0, 1)
     ]
-    pd.DataFrame(rows).to_csv(tmp_path / "results.csv", index=False)
-    table = report.results_table(tmp_path / "results.csv")
+    table = report.results_table(pd.DataFrame(rows))
     line = table.splitlines()[2]
     assert "0.00 [0.00, 0.00] / 0.50 [0.50, 0.50]" in line and "1.00 [1.00, 1.00] / 1.00 [1.00, 1.00]" in line
     assert f"{np.mean([0, 1, 1]):.2f} / {np.mean([0.5, 1, 0]):.2f}" in line and "0.95 / 0.08" in line
@@ -49,3 +49,62 @@ def test_between_marks_replaces_only_what_is_between():
     assert report.between_marks(page, "t", "new") == "a\n<!-- t:begin -->\nnew\n<!-- t:end -->\nb"
     with pytest.raises(ValueError, match="no marks"):
         report.between_marks(page, "other", "new")
+
+
+# --- Studies ---
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """Results of two studies on CarRun (R_min 204.2873, R_max 574.6533), in a folder of their own."""
+    rows = []
+    for name, gain, pay in (("C2IQL", 1.0, 0.5), ("CPQ", 0.5, 2.0)):
+        for seed in (0, 1, 2):
+            for limit in (10, 20, 40):
+                row = {"task": "CarRun", "algorithm": name, "profile": "small", "seed": seed, "episode": 0}
+                score = gain + 0.01 * seed
+                row |= {"threshold": limit, "return": 204.2873 + score * 370.366, "cost": pay * limit}
+                rows.append(row | {"length": 200, "predicted_cost": 1.0, "updates": 5})
+    pd.DataFrame(rows).to_csv(tmp_path / "table1.csv", index=False)
+    noise = [row | {"task": "CarCircle", "threshold": 50, "crm_noise": 0.2} for row in rows[:3]]
+    noise += [row | {"crm_noise": 4.0, "cost": row["cost"] + 5} for row in noise]
+    pd.DataFrame(noise).to_csv(tmp_path / "crm-noise.csv", index=False)
+    monkeypatch.setattr(report, "load_results", lambda name: load_results(name, tmp_path))
+    monkeypatch.setattr(report, "RESULTS", tmp_path)
+    return tmp_path
+
+
+def cells(table):
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()]
+
+
+def test_baselines_by_hand(folder):
+    head, _, *rows = cells(report.baselines_table())
+    found = {row[0]: dict(zip(head, row, strict=True)) for row in rows}
+    assert found["C2IQL"]["CarRun"] == "1.01 / 0.50" and found["CPQ"]["CarRun"] == "*0.51 / 2.00*"
+    assert found["C2IQL"]["AntRun"] == found["CPQ"]["BallRun"] == "not run"
+    assert found["C2IQL"]["BallRun"] != "not run"  # of the first runs
+    (missing,) = (name for name in found if name.startswith("BC-All"))
+    assert "FISOR" in missing and "CPQ" not in missing and found[missing]["CarRun"] == "not run"
+    assert found["the paper's C2IQL, on DSRL's data"]["AntRun"] == "0.74 / 0.94"
+    assert found["the paper's CPQ, on DSRL's data"]["CarRun"] == "*0.94 / 1.42*"
+
+
+def test_a_studys_section_has_its_table_figure_and_verdicts_or_says_that_it_was_not_run(folder):
+    assert "*Not run: `c2iql study kappas` makes it.*" in report.study_section("kappas")
+    assert report.write_study("kappas") is None
+    assert report.write_study("crm-noise") == folder / "crm-noise.png"
+    text = report.study_section("crm-noise")
+    assert "![crm-noise](results/crm-noise.png)" in text
+    table = text.split("\n\n")[2]
+    head, _, *rows = cells(table)
+    assert head == ["task", "crm_noise", "seeds", "middle limit", "reward", "cost"]
+    assert [row[1] for row in rows] == ["0.2", "4.0"]
+    assert "| much noise (4.0) pays less than a little (0.2) |" in text
+    with pytest.raises(ValueError, match="unknown study"):
+        report.write_study("crm")
+
+
+def test_every_study_has_a_section():
+    text = report.studies_text()
+    assert [line[4:] for line in text.splitlines() if line.startswith("### ")] == list(report.STUDIES)

@@ -222,11 +222,21 @@ def bench(
     print(simulation_speeds.to_string(index=False, formatters=formats))
 
 
-def report() -> None:
-    """Make the tables of README.md and data/README.md, and the pictures of the datasets, from the files."""
+def report(name: Positional[str | None] = None) -> None:
+    """Make tables and figures from the results' files: of one study, or all, and the pages that show them.
+
+    Args:
+        name: a study, whose table is printed and whose figure is drawn; without it README.md, data/README.md,
+            the pictures of the datasets and all studies' figures.
+    """
     from tutorial_lib import report as reporting
 
-    print("\n".join(f"wrote {path}" for path in reporting.write()))
+    if name is None:
+        print("\n".join(f"wrote {path}" for path in reporting.write()))
+        return
+    path = reporting.write_study(name)
+    print(reporting.study_section(name))
+    print(f"wrote {path}" if path else "no figure")
 
 
 def with_options(config: Config, options: tuple[str, ...]) -> Config:

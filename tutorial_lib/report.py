@@ -11,23 +11,13 @@ import pandas as pd
 
 from tutorial_lib.datasets import SHIPPED_DATA, load_dataset, shipped_tasks
 from tutorial_lib.evaluation import summarise, with_scores
-from tutorial_lib.tasks import get_task
+from tutorial_lib.paper import CLAIMS, TABLE1
+from tutorial_lib.results import RESULTS, SCORES, load_results, not_run, options_of, over_seeds, verdicts
+from tutorial_lib.studies import STUDIES, get_study
+from tutorial_lib.tasks import TASKS, get_task
 
 ROOT = SHIPPED_DATA.parent
-FIRST_LIGHT = SHIPPED_DATA / "results" / "first-light.csv"
-
-PAPER_C2IQL = {
-    "AntRun": (0.72, 1.00),
-    "BallRun": (0.59, 0.95),
-    "CarRun": (0.95, 0.08),
-    "DroneRun": (0.71, 0.73),
-    "AntCircle": (0.66, 0.76),
-    "BallCircle": (0.72, 0.85),
-    "CarCircle": (0.74, 0.93),
-    "DroneCircle": (0.78, 0.85),
-}
-"""The paper's Table 1, last rows: C2IQL's normalised reward and cost, on DSRL's data."""
-
+FIRST_LIGHT = RESULTS / "first-light.csv"
 
 DSRL_FRONTIER = {
     "BallRun": {0: 440, 20: 450, 50: 900, 80: 1300},
@@ -72,30 +62,120 @@ def frontier() -> str:
     return markdown(pd.DataFrame(rows))
 
 
-def results_table(path: Path = FIRST_LIGHT) -> str:
+def newest_results() -> pd.DataFrame:
+    """C2IQL on every task: the study of Table 1, and the first runs for the tasks that it does not have."""
+    studied, first = load_results("table1"), pd.read_csv(FIRST_LIGHT)
+    studied = studied[studied["algorithm"] == "C2IQL"]
+    parts = [studied, first[~first["task"].isin(studied["task"])]]
+    results = pd.concat([part for part in parts if len(part)], ignore_index=True)
+    return results.sort_values("task", key=lambda column: column.map(list(TASKS).index), kind="stable")
+
+
+def results_table(results: pd.DataFrame | None = None) -> str:
     """C2IQL per task: scores per threshold with 95% intervals, and the paper's mean beside ours."""
-    results = pd.read_csv(path)
+    results = newest_results() if results is None else results
     rows = []
     for task, part in results.groupby("task", sort=False):
-        scores, row = with_scores(part), {"task": task}
+        scores, row = with_scores(part), {"task": task, "seeds": part["seed"].nunique()}
         for _, line in summarise(part).iterrows():
             limit = get_task(task).cost_limit_names[line["threshold"]]
             row[f"{limit} limit: reward / cost"] = " / ".join(
-                f"{line[name]:.2f} [{line[f'{name}_low']:.2f}, {line[f'{name}_high']:.2f}]"
-                for name in ("reward_score", "cost_score")
+                f"{line[name]:.2f} [{line[f'{name}_low']:.2f}, {line[f'{name}_high']:.2f}]" for name in SCORES
             )
-        row["mean: reward / cost"] = (
-            f"{scores['reward_score'].mean():.2f} / {scores['cost_score'].mean():.2f}"
-        )
-        paper = PAPER_C2IQL[task]
-        row["the paper's, on DSRL's data"] = f"{paper[0]:.2f} / {paper[1]:.2f}"
+        row["mean: reward / cost"] = _pair(*(scores[name].mean() for name in SCORES))
+        row["the paper's, on DSRL's data"] = _pair(*TABLE1["C2IQL"][task])
         rows.append(row)
     return markdown(pd.DataFrame(rows))
 
 
+def baselines_table() -> str:
+    """Our algorithms on all tasks, what was not run, and the paper's: mean reward / mean cost."""
+    ours = pd.concat([newest_results(), load_results("table1").query("algorithm != 'C2IQL'")])
+    found = over_seeds(ours).set_index(["algorithm", "task"])
+    run = found.index.get_level_values(0).unique()
+    missing = [name for name in ("BC-All", "BC-Safe", *TABLE1) if name not in run]
+    rows = []
+    for name in run:
+        row = {"": name, "seeds": found.loc[name, "seeds"].min()}
+        for task in TASKS:
+            key = (name, task)
+            row[task] = _pair(*found.loc[key, list(SCORES)]) if key in found.index else "not run"
+        rows.append(row)
+    if missing:
+        rows.append({"": ", ".join(missing), "seeds": "-"} | dict.fromkeys(TASKS, "not run"))
+    for name in ("C2IQL", *(name for name in run if name in TABLE1 and name != "C2IQL")):
+        row = {"": f"the paper's {name}, on DSRL's data", "seeds": 5}
+        rows.append(row | {task: _pair(*TABLE1[name][task]) for task in TASKS})
+    return markdown(pd.DataFrame(rows))
+
+
+def _pair(reward: float, cost: float) -> str:
+    text = f"{reward:.2f} / {cost:.2f}"
+    return f"*{text}*" if round(cost, 2) > 1 else text
+
+
+# --- Studies ---
+
+
+def study_table(results: pd.DataFrame) -> pd.DataFrame:
+    """One row per task and variant: reward / cost at each limit; mean and standard deviation over seeds."""
+    by = ["task", "algorithm", *options_of(results)]
+    rows = []
+    for key, part in results.groupby(by, sort=False, dropna=False):
+        row = dict(zip(by, key, strict=True)) | {"seeds": part["seed"].nunique()}
+        if len(by) > 2 and results["algorithm"].nunique() == 1:
+            del row["algorithm"]
+        if "reconstruction_error" in part:
+            row["error of the model"] = f"{part['reconstruction_error'].mean():.1f}"
+        limits = with_scores(part).groupby("threshold")[list(SCORES)].mean()
+        for limit, scores in limits.iterrows():
+            word = get_task(row["task"]).cost_limit_names.get(limit)
+            row[f"{word} limit" if word else f"limit {limit:g}"] = _pair(*scores)
+        mean = over_seeds(part, ("task",)).iloc[0]
+        for score, word in zip(SCORES, ("reward", "cost"), strict=True):
+            row[word] = f"{mean[score]:.2f} ± {mean[f'{score}_std']:.2f}"
+        rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def study_section(name: str) -> str:
+    """A study's question, table, figure and verdicts on the paper's claims, or that it was not run."""
+    results, lines = load_results(name), [f"### {name}", "", get_study(name).question, ""]
+    if not len(results):
+        return "\n".join([*lines, f"*{not_run(name).capitalize()}.*"])
+    lines += [markdown(study_table(results)), ""]
+    if (RESULTS / f"{name}.png").exists():
+        lines += [f"![{name}](results/{name}.png)", ""]
+    claims = [claim for claim in CLAIMS if claim.study == name]
+    if claims:
+        lines += [markdown(verdicts(claims, results)), ""]
+    return "\n".join(lines).rstrip()
+
+
+def studies_text() -> str:
+    """Every study's section."""
+    return "\n\n".join(study_section(name) for name in STUDIES)
+
+
+def write_study(name: str) -> Path | None:
+    """Draw a study's figure beside its results; None where it was not run."""
+    from tutorial_lib.plotting import study_figure
+
+    get_study(name)  # raises ValueError where there is none
+    results = load_results(name)
+    if not len(results):
+        return None
+    path = RESULTS / f"{name}.png"
+    path.write_bytes(study_figure(name, results).small_png())
+    return path
+
+
+# --- Pages ---
+
+
 def markdown(table: pd.DataFrame) -> str:
     """A table in Markdown."""
-    lines = [table.columns, ["---"] * len(table.columns), *table.astype(str).values]
+    lines = [table.columns, ["---"] * len(table.columns), *table.astype(object).fillna("").astype(str).values]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
@@ -112,15 +192,20 @@ def pages() -> dict[Path, str]:
     """Every page that holds made tables, as it should read now."""
     data, readme = SHIPPED_DATA / "README.md", ROOT / "README.md"
     text = data.read_text()
-    for name, table in (("datasheet", datasheet), ("frontier", frontier), ("results", results_table)):
+    tables = {"datasheet": datasheet, "frontier": frontier, "results": results_table}
+    for name, table in (tables | {"studies": studies_text}).items():
         text = between_marks(text, name, table())
-    return {data: text, readme: between_marks(readme.read_text(), "results", results_table())}
+    front = readme.read_text()
+    for name, table in (("results", results_table), ("baselines", baselines_table)):
+        front = between_marks(front, name, table())
+    return {data: text, readme: front}
 
 
 def write() -> list[Path]:
-    """Bring the pages and the pictures of the datasets up to date. Returns what it wrote."""
+    """Bring the pages, the pictures of the datasets and the studies' figures up to date. Returns them all."""
     from tutorial_lib.plotting import cost_return_plane
 
+    figures = [path for path in map(write_study, STUDIES) if path]
     written = pages()
     for path, text in written.items():
         path.write_text(text)
@@ -128,4 +213,4 @@ def write() -> list[Path]:
     for path in pictures:
         path.parent.mkdir(exist_ok=True)
         path.write_bytes(cost_return_plane(load_dataset(path.stem), get_task(path.stem)).small_png())
-    return [*written, *pictures]
+    return [*written, *pictures, *figures]

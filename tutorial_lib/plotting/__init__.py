@@ -8,4 +8,5 @@ from tutorial_lib.plotting.episodes import *
 from tutorial_lib.plotting.logs import *
 from tutorial_lib.plotting.reconstruction import *
 from tutorial_lib.plotting.results import *
+from tutorial_lib.plotting.studies import *
 from tutorial_lib.plotting.style import *

@@ -1,0 +1,226 @@
+"""Results per seed, intervals and verdicts against loops and made-up results; the paper's tables; figures."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from tutorial_lib import plotting
+from tutorial_lib.algorithms import ALGORITHMS
+from tutorial_lib.paper import CLAIMS, TABLE1, TABLE1_AVERAGES, TABLE1_STD, TABLE2, Claim
+from tutorial_lib.results import (
+    difference,
+    load_results,
+    options_of,
+    over_seeds,
+    seed_interval,
+    seed_means,
+    verdicts,
+)
+from tutorial_lib.studies import STUDIES, varied_options
+from tutorial_lib.tasks import TASKS
+
+
+def make_results(groups, seeds=(0, 1, 2), limits=(30, 50, 70), task="CarCircle", episodes=2, noise=0.0):
+    """Rows of groups (columns, reward, cost in limits); seed s adds s / 100 to both; `noise` per run."""
+    rng, rows = np.random.default_rng(0), []
+    low, high = TASKS[task].min_return, TASKS[task].max_return
+    for columns, reward, cost in groups:
+        for seed in seeds:
+            shift = seed / 100 + noise * rng.normal()
+            for limit in limits:
+                for episode in range(episodes):
+                    row = {"task": task, "algorithm": "C2IQL", "profile": "small", "seed": seed}
+                    row |= {"threshold": limit, "episode": episode, "length": 300, "updates": 1}
+                    row |= {"return": low + (reward + shift) * (high - low), "cost": (cost + shift) * limit}
+                    rows.append(row | {"predicted_cost": 0.8 * limit} | columns)
+    return pd.DataFrame(rows)
+
+
+# --- The paper's tables ---
+
+
+def test_the_averages_of_table_1_are_those_that_it_prints():
+    assert TABLE1.keys() == TABLE1_AVERAGES.keys()
+    for name, rows in TABLE1.items():
+        assert rows.keys() == TASKS.keys() == TABLE1_STD.keys()
+        found = np.mean(list(rows.values()), axis=0)
+        assert found == pytest.approx(TABLE1_AVERAGES[name], abs=0.008), name  # some cut off, not rounded
+
+
+def test_table_2_has_a_column_for_each_noise_level():
+    assert {len(row) for row in TABLE2.values()} == {8}
+    assert all(cost <= 50 for cost in TABLE2["cost"])
+
+
+def test_every_claim_is_about_a_study_and_what_it_varies():
+    for claim in CLAIMS:
+        varied = {"algorithm", *varied_options(STUDIES[claim.study])}
+        for side in (claim.high, claim.low):
+            assert not isinstance(side, dict) or set(side) <= varied
+        for side in (claim.high, claim.low):
+            if isinstance(side, dict) and "algorithm" in side:
+                assert side["algorithm"] in ALGORITHMS
+
+
+# --- Per seed ---
+
+
+def test_a_seeds_mean_is_that_of_its_limits_whatever_their_numbers_of_episodes():
+    results = make_results([({}, 0.5, 0.4)])
+    extra = results[(results["seed"] == 1) & (results["threshold"] == 30)].assign(cost=300.0)
+    results = pd.concat([results] + [extra] * 5, ignore_index=True)
+    found = seed_means(results).set_index("seed")
+    for seed in (0, 1, 2):
+        by_limit = []
+        for limit in (30, 50, 70):
+            costs = [
+                row["cost"] / limit
+                for _, row in results.iterrows()
+                if row["seed"] == seed and row["threshold"] == limit
+            ]
+            by_limit.append(sum(costs) / len(costs))
+        assert found.loc[seed, "cost_score"] == pytest.approx(sum(by_limit) / 3)
+        assert found.loc[seed, "reward_score"] == pytest.approx(0.5 + seed / 100)
+
+
+def test_over_seeds_by_hand():
+    row = over_seeds(make_results([({}, 0.5, 0.4)])).iloc[0]
+    assert (row["task"], row["algorithm"], row["seeds"]) == ("CarCircle", "C2IQL", 3)
+    assert row["reward_score"] == pytest.approx(0.51) and row["reward_score_std"] == pytest.approx(0.01)
+    half = 4.302653 * 0.01 / 3**0.5  # Student's t of two degrees of freedom, from a printed table
+    assert row["cost_score_low"] == pytest.approx(0.41 - half, abs=1e-6)
+    assert row["cost_score_high"] == pytest.approx(0.41 + half, abs=1e-6)
+    assert np.isnan(over_seeds(make_results([({}, 0.5, 0.4)], seeds=(0,))).iloc[0]["cost_score_low"])
+
+
+@pytest.mark.parametrize("seeds", [3, 5])
+def test_the_interval_over_seeds_covers_the_truth_nineteen_times_in_twenty(seeds):
+    rng = np.random.default_rng(0)
+    hits = 0
+    for values in rng.normal(2.0, 0.7, size=(4_000, seeds)):
+        low, high = seed_interval(values)
+        hits += low <= 2.0 <= high
+    assert hits / 4_000 == pytest.approx(0.95, abs=0.012)
+    assert np.isnan(seed_interval([1.0])).all()
+
+
+def test_a_difference_is_paired_by_seed():
+    noisy = [({"crm_noise": 0.2}, 0.7, 0.9), ({"crm_noise": 4.0}, 0.6, 0.5)]
+    results = pd.concat(
+        [make_results(noisy[:1], seeds=(0, 1, 2)), make_results(noisy[1:], seeds=(1, 2, 9))],
+        ignore_index=True,
+    )
+    found = difference(results, "reward_score", {"crm_noise": 0.2}, {"crm_noise": 4.0})
+    assert found == pytest.approx([0.1, 0.1])  # seeds 1 and 2, whose shifts cancel
+    above = difference(results, "cost_score", {"crm_noise": 0.2}, 1.0)
+    assert above == pytest.approx([-0.1, -0.09, -0.08])
+    assert len(difference(results, "cost_score", {"crm_noise": 7.0}, 1.0)) == 0
+
+
+# --- Verdicts ---
+
+
+CLAIM = Claim("kappas", "more earns more", "Fig. 0", "reward_score", {"kappa_1": 0.9}, {"kappa_1": 0.5})
+
+
+@pytest.mark.parametrize(
+    ("high", "low", "noise", "seeds", "verdict"),
+    [
+        (0.8, 0.6, 0.001, (0, 1, 2), "agrees"),
+        (0.6, 0.8, 0.001, (0, 1, 2), "contradicts"),
+        (0.61, 0.6, 0.1, (0, 1, 2), "undecided"),
+        (0.9, 0.1, 0.0, (0,), "undecided"),
+    ],
+)
+def test_a_verdict_needs_an_interval_on_one_side_of_zero(high, low, noise, seeds, verdict):
+    groups = [({"kappa_1": 0.9}, high, 0.5), ({"kappa_1": 0.5}, low, 0.5)]
+    table = verdicts([CLAIM], make_results(groups, seeds, noise=noise))
+    assert table["ours"].tolist() == [verdict] and table["task"].tolist() == ["CarCircle"]
+
+
+def test_what_was_not_run_is_said_so():
+    empty = load_results("no-such-study")
+    assert verdicts([CLAIM], empty)["ours"].tolist() == ["not run"]
+    half = make_results([({"kappa_1": 0.9}, 0.5, 0.5)])
+    assert verdicts([CLAIM], half)["ours"].tolist() == ["not run"]
+
+
+def test_where_restricts_both_sides():
+    groups = [({"kappa_1": 0.9}, 0.8, 0.5), ({"kappa_1": 0.5}, 0.6, 0.5)]
+    results = make_results(groups, noise=0.001)
+    results.loc[(results["threshold"] != 50) & (results["kappa_1"] == 0.9), "return"] -= 500
+    at = Claim("kappas", "more", "", "reward_score", {"kappa_1": 0.9}, {"kappa_1": 0.5}, {"threshold": 50})
+    assert verdicts([CLAIM], results)["ours"].tolist() == ["contradicts"]
+    assert verdicts([at], results)["ours"].tolist() == ["agrees"]
+
+
+# --- Figures ---
+
+
+def lines_of(ax):
+    return {line.get_label(): line for line in ax.lines if not line.get_label().startswith("_")}
+
+
+def test_variants_draws_each_limits_mean_for_each_variant():
+    groups = [({"algorithm": "CIQL"}, 0.3, 0.2), ({"algorithm": "C2IQL"}, 0.7, 0.9)]
+    figure = plotting.variants(make_results(groups))
+    left, right = figure.axes
+    assert lines_of(left)["CIQL"].get_ydata() == pytest.approx([0.31] * 3)
+    assert lines_of(right)["C2IQL"].get_ydata() == pytest.approx([0.91] * 3)
+    assert [label.get_text() for label in right.get_xticklabels()] == ["30", "50", "70"]
+
+
+def test_variants_are_named_by_what_differs():
+    both = make_results(
+        [({"time_limits": "rate", "kappa_1": 1}, 1, 1), ({"time_limits": "mask", "kappa_1": 1}, 1, 1)]
+    )
+    assert set(plotting.variant_names(both)) == {"time limits: rate", "time limits: mask"}
+    sizes = [("linear", 64, 2), ("mlp", 16, 1)]
+    columns = [dict(zip(("crm", "crm_width", "crm_layers"), size, strict=True)) for size in sizes]
+    assert set(plotting.variant_names(make_results([(c, 1, 1) for c in columns]))) == {"linear", "1 x 16"}
+    assert options_of(both) == ["time_limits", "kappa_1"]
+
+
+def test_expectiles_has_a_line_for_each_kappa_2():
+    groups = [({"kappa_1": a, "kappa_2": b}, a, b) for a in (0.5, 0.7, 0.9) for b in (0.5, 0.9)]
+    left, right = plotting.expectiles(make_results(groups)).axes
+    assert lines_of(left)[r"$\kappa_2$ = 0.9 (policy)"].get_ydata() == pytest.approx([0.51, 0.71, 0.91])
+    assert lines_of(right)[r"$\kappa_2$ = 0.5 (policy)"].get_ydata() == pytest.approx([0.51] * 3)
+
+
+def test_noise_levels_shows_the_papers_beside_ours():
+    groups = [({"crm_noise": level}, 0.5, 0.8) for level in (0.0, 0.5, 4.0)]
+    right = plotting.noise_levels(make_results(groups)).axes[1]
+    assert lines_of(right)["our cost"].get_ydata() == pytest.approx([0.81 * 50] * 3)
+    assert list(lines_of(right)["the paper's"].get_ydata()) == [46.60, 47.89, 36.20]
+
+
+def test_per_limit_shows_the_cost_paid_under_each_tasks_own_limits():
+    parts = [make_results([({}, 0.5, 0.8)], task="CarRun", limits=(10, 20, 40))]
+    parts += [make_results([({}, 0.7, 0.5), ({"algorithm": "CPQ"}, 0.2, 2.0)])]
+    mixed = pd.concat(parts).sample(frac=1, random_state=0)  # whatever the rows' order
+    figure = plotting.per_limit(mixed)
+    costs = {
+        ax.get_xlabel() and tuple(ax.get_xticks()): lines_of(ax) for ax in figure.axes if ax.get_xlabel()
+    }
+    assert costs[(10, 20, 40)]["C2IQL"].get_ydata() == pytest.approx([8.1, 16.2, 32.4])
+    assert costs[(30, 50, 70)]["CPQ"].get_ydata() == pytest.approx([60.3, 100.5, 140.7])
+
+
+def test_against_paper_marks_the_papers_value():
+    left = plotting.against_paper(make_results([({}, 0.5, 0.8)])).axes[0]
+    assert lines_of(left)["the paper's, on DSRL's data"].get_ydata().tolist() == [0.74]
+
+
+def test_promises_draws_every_agents_means():
+    (ax,) = plotting.promises(make_results([({}, 0.5, 0.8)])).axes
+    line = lines_of(ax)["high limit"]
+    assert line.get_xdata() == pytest.approx([56] * 3) and line.get_ydata() == pytest.approx([56, 56.7, 57.4])
+
+
+def test_without_rows_every_figure_says_that_nothing_was_run():
+    empty = load_results("no-such-study")
+    draws = (plotting.variants, plotting.expectiles, plotting.noise_levels, plotting.per_limit)
+    for draw in (*draws, plotting.against_paper, plotting.promises):
+        (ax,) = draw(empty).axes
+        assert ax.texts[0].get_text() == "not run: no results to draw"

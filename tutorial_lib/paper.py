@@ -1,0 +1,177 @@
+"""What the paper reports, for every place that shows it beside ours: always labelled, never a target.
+
+Its results are on DSRL's data, profile `paper`, five seeds; ours are on data of our own. Figures 3, 4 and 7
+are learning curves without printed values: what the text says of them is here as claims to be tested.
+"""
+
+from dataclasses import dataclass, field
+
+COLUMNS = "AntRun BallRun CarRun DroneRun AntCircle BallCircle CarCircle DroneCircle".split()
+_TABLE1 = {
+    "BCQ-Lag": ("0.56 0.27 0.92 0.76 0.76 0.64 0.67 0.96", "0.28 0.39 0.10 1.62 1.73 0.98 1.23 2.09"),
+    "BEAR-Lag": ("0.14 0.22 0.80 0.02 0.41 0.75 0.73 0.85", "0.02 1.97 3.71 0.89 1.10 1.18 1.50 1.59"),
+    "COptiDICE": ("0.57 0.47 0.90 0.63 0.19 0.62 0.43 0.40", "0.22 1.25 0.00 1.40 0.91 0.99 1.20 0.42"),
+    "CPQ": ("0.05 0.63 0.94 0.33 0.02 0.63 0.59 0.13", "0.00 1.41 1.42 1.62 0.06 0.87 1.03 0.24"),
+    "FISOR": ("0.18 0.24 0.80 0.20 0.11 0.25 0.23 0.46", "0.00 0.00 0.01 0.41 0.00 0.03 0.00 0.00"),
+    "VOCE": ("0.32 0.79 0.43 0.48 0.00 0.85 0.39 0.12", "0.86 1.04 6.58 1.58 1.01 1.34 1.43 0.57"),
+    "WSAC": ("0.25 0.80 0.86 0.66 0.40 0.69 0.61 0.02", "0.18 1.98 0.40 2.52 0.98 0.78 0.51 0.45"),
+    "CDT": ("0.72 0.56 0.95 0.66 0.54 0.78 0.72 0.75", "1.00 0.97 0.80 0.73 0.96 0.96 0.95 0.97"),
+    "C2IQL": ("0.74 0.59 0.95 0.71 0.66 0.72 0.74 0.78", "0.94 0.95 0.08 0.73 0.76 0.85 0.93 0.85"),
+}
+TABLE1: dict[str, dict[str, tuple[float, float]]] = {
+    algorithm: dict(zip(COLUMNS, zip(*(map(float, row.split()) for row in rows), strict=True), strict=True))
+    for algorithm, rows in _TABLE1.items()
+}
+"""The paper's Table 1: normalised reward and cost by algorithm and task, means over seeds and limits."""
+
+TABLE1_AVERAGES = {
+    "BCQ-Lag": (0.69, 1.05),
+    "BEAR-Lag": (0.49, 1.49),
+    "COptiDICE": (0.53, 0.80),
+    "CPQ": (0.41, 0.83),
+    "FISOR": (0.31, 0.06),
+    "VOCE": (0.42, 1.80),
+    "WSAC": (0.54, 0.97),
+    "CDT": (0.71, 0.91),
+    "C2IQL": (0.74, 0.76),
+}
+"""Its last column, as printed."""
+
+TABLE1_STD = {
+    "AntRun": (0.01, 0.05),
+    "BallRun": (0.05, 0.07),
+    "CarRun": (0.01, 0.17),
+    "DroneRun": (0.02, 0.16),
+    "AntCircle": (0.06, 0.13),
+    "BallCircle": (0.03, 0.07),
+    "CarCircle": (0.01, 0.07),
+    "DroneCircle": (0.02, 0.11),
+}
+"""Its standard deviations of C2IQL's reward and cost. Of what is not said."""
+
+TABLE2 = {
+    "noise": (0.0, 0.1, 0.2, 0.3, 0.5, 1.0, 2.0, 4.0),
+    "mse": (0.025, 1.10, 1.77, 2.25, 3.35, 4.41, 5.76, 7.84),
+    "return": (434.01, 435.07, 442.08, 435.67, 435.60, 421.82, 408.77, 401.89),
+    "cost": (46.60, 47.20, 48.30, 47.30, 47.89, 42.10, 34.90, 36.20),
+}
+"""The paper's Table 2, on CarCircle at limit 50: no spread and no number of seeds are given."""
+
+
+@dataclass(frozen=True)
+class Claim:
+    """The paper says that `score` is larger in the `high` rows of a study than in the `low` ones.
+
+    A number for `low` stands for itself. `where` restricts both to some rows.
+    """
+
+    study: str
+    words: str
+    source: str
+    score: str
+    high: dict
+    low: dict | float
+    where: dict = field(default_factory=dict)
+
+
+def _algorithm(name: str) -> dict:
+    return {"algorithm": name}
+
+
+def _noise(level: float) -> dict:
+    return {"crm_noise": level}
+
+
+MIDDLE = {"threshold": 50}
+CLAIMS = (
+    Claim(
+        "ablations",
+        "C2IQL earns more than without cost reconstruction",
+        "4.2, Fig. 3",
+        "reward_score",
+        _algorithm("C2IQL"),
+        _algorithm("C2IQL w/o CR"),
+    ),
+    Claim(
+        "ablations",
+        "without conditioning, less cost is paid",
+        "4.2, Fig. 3",
+        "cost_score",
+        _algorithm("C2IQL"),
+        _algorithm("C2IQL w/o CC"),
+    ),
+    Claim(
+        "ablations",
+        "C2IQL earns more than CIQL",
+        "4.2, Fig. 3",
+        "reward_score",
+        _algorithm("C2IQL"),
+        _algorithm("CIQL"),
+    ),
+    Claim(
+        "ablations",
+        "CIQL pays less than C2IQL",
+        "4.2, Fig. 3",
+        "cost_score",
+        _algorithm("C2IQL"),
+        _algorithm("CIQL"),
+    ),
+    Claim(
+        "kappas",
+        "kappa_1 = 0.9 pays more than 0.5",
+        "4.3, Fig. 4",
+        "cost_score",
+        {"kappa_1": 0.9},
+        {"kappa_1": 0.5},
+        MIDDLE,
+    ),
+    Claim(
+        "kappas",
+        "kappa_1 = 0.9 breaks the limit",
+        "4.3, Fig. 4",
+        "cost_score",
+        {"kappa_1": 0.9},
+        1.0,
+        MIDDLE,
+    ),
+    Claim(
+        "kappas",
+        "kappa_2 = 0.9 earns more than 0.5",
+        "4.3, Fig. 4",
+        "reward_score",
+        {"kappa_2": 0.9},
+        {"kappa_2": 0.5},
+        MIDDLE,
+    ),
+    Claim(
+        "crm-noise",
+        "a little noise (0.2) earns more than none",
+        "4.4, Table 2",
+        "reward_score",
+        _noise(0.2),
+        _noise(0.0),
+        MIDDLE,
+    ),
+    Claim(
+        "crm-noise",
+        "much noise (4.0) earns less than a little (0.2)",
+        "4.4, Table 2",
+        "reward_score",
+        _noise(0.2),
+        _noise(4.0),
+        MIDDLE,
+    ),
+    Claim(
+        "crm-noise",
+        "much noise (4.0) pays less than a little (0.2)",
+        "4.4, Table 2",
+        "cost_score",
+        _noise(0.2),
+        _noise(4.0),
+        MIDDLE,
+    ),
+    Claim(
+        "table1", "C2IQL earns more than CPQ", "4.1", "reward_score", _algorithm("C2IQL"), _algorithm("CPQ")
+    ),
+)
+"""What the paper's words say about its figures and tables, as comparisons that our results can test."""
