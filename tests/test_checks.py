@@ -109,9 +109,30 @@ def least_cost(cmdp):
     return cmdp.initial @ v
 
 
+def implicit_policy(mu, q, v, slope):
+    u = np.where(q == v, 1e-6, q - v)
+    return mu * np.abs(slope(u) / u) / (mu * np.abs(slope(u) / u)).sum()
+
+
+def batched_loss(weight, q_cost, value):
+    return (weight * (q_cost[:, 0] - value) ** 2).mean()
+
+
+def unnormalised(mu, q, v, slope):
+    return mu * slope(q - v) / (q - v)
+
+
+def at_zero(mu, q, v, slope):
+    with np.errstate(invalid="ignore"):
+        ratio = np.nan_to_num(slope(q - v) / (q - v))
+    return mu * ratio / (mu * ratio).sum()
+
+
 ANSWERS = {
     checks.check_run_cost: run_cost,
     checks.check_least_cost: least_cost,
+    checks.check_implicit_policy: implicit_policy,
+    checks.check_batched_loss: batched_loss,
     checks.check_keeps_limit: keeps_limit,
     checks.check_normalised_return: normalised_return,
     checks.check_implicit_cost_value: implicit_cost_value,
@@ -125,6 +146,12 @@ MISTAKES = [
     (checks.check_least_cost, lambda cmdp: cmdp.initial @ cmdp.costs.min(1), "at every step"),
     (checks.check_least_cost, lambda cmdp: cmdp.initial @ cmdp.costs.min(1) / (1 - cmdp.gamma), "look ahead"),
     (checks.check_least_cost, lambda cmdp: least_cost(cmdp) / cmdp.initial.max(), "cmdp.initial"),
+    (checks.check_implicit_policy, unnormalised, "divide by the sum"),
+    (checks.check_implicit_policy, lambda mu, q, v, f: mu * abs(f(q - v)), "so pi_imp is mu"),
+    (checks.check_implicit_policy, at_zero, "take the limit"),
+    (checks.check_batched_loss, lambda w, q, v: (w * (q - v) ** 2).mean(), "two errors, not four"),
+    (checks.check_batched_loss, lambda w, q, v: (w * (q - v[:, None]) ** 2).mean(), "its own weight"),
+    (checks.check_batched_loss, lambda w, q, v: (w * (q[:, 0] - v) ** 2).sum(), "a mean over"),
     (checks.check_keeps_limit, lambda costs, limit: max(costs) <= limit, "expectation"),
     (checks.check_keeps_limit, lambda costs, limit: np.mean(costs) < limit, "at most"),
     (checks.check_keeps_limit, lambda costs, limit: np.median(costs) <= limit, "their mean is not"),

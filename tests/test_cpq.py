@@ -10,7 +10,7 @@ import torch
 from torch.func import functional_call
 
 from tutorial_lib import training
-from tutorial_lib.algorithms import CPQ
+from tutorial_lib.algorithms.cpq import CPQ, latent_divergences
 from tutorial_lib.config import Config
 from tutorial_lib.datasets import Batch, Dataset
 from tutorial_lib.tasks import TASKS
@@ -305,6 +305,19 @@ def test_actions_outside_the_data_come_to_look_too_costly():
         recorded = agent.network("cost_critics")(s, torch.tensor(data.actions)).amin(0)
         opposite = agent.network("cost_critics")(s, -torch.tensor(data.actions)).amin(0)
     assert recorded.abs().mean() < 0.3 * limit and (opposite > limit).float().mean() > 0.9
+
+
+def test_a_vae_finds_random_actions_strange_where_the_recorded_ones_tell_something():
+    """Recorded are 0.9 and -0.9 at random, so the latent must say which; others spread there."""
+    rng = np.random.default_rng(1)
+    data = dataset(rows=1000)
+    corners = rng.choice([-0.9, 0.9], size=(1000, ACT)).astype(np.float32)
+    data = dataclasses.replace(data, actions=corners)
+    known, random = latent_divergences(data, updates=200, width=32, n=500)
+    assert known.shape == random.shape == (500,) and (known >= 0).all()
+    again = latent_divergences(data, updates=200, width=32, n=500)
+    assert np.array_equal(known, again[0]) and np.array_equal(random, again[1])
+    assert np.std(known) < np.std(random)
 
 
 def test_the_action_that_runs_is_the_squashed_mean_without_noise():

@@ -216,3 +216,47 @@ def test_cost_return_plane_has_a_dot_per_episode_and_a_line_per_threshold():
     dots, *limits = plotting.cost_return_plane(dataset, task).axes[0].lines
     assert dots.get_xydata().tolist() == [[2, 3], [1, 12]]
     assert [line.get_xdata()[0] for line in limits] == [30, 50, 70]
+
+
+def test_outside_data_counts_the_critics_that_call_an_action_safe():
+    grid = np.linspace(-1, 1, 5)
+    estimates = np.array([[0, 0, 0, 9, 9.0], [0, 0, 0, 0, 9.0]])
+    figure = plotting.outside_data(grid, estimates, [0, 0, 5, 9, 9], [-0.5, 0.25], limit=4)
+    left, right = figure.axes
+    assert right.lines[0].get_ydata().tolist() == [1, 1, 1, 0.5, 0]
+    assert right.lines[1].get_ydata().tolist() == [1, 1, 0, 0, 0]
+    assert left.patches[0].get_x() == -0.5 and left.patches[0].get_width() == 0.75
+    assert set(labelled(left, "limit").get_ydata()) == {4}
+
+
+def test_ood_detector_marks_the_upper_quarter():
+    known, random = np.geomspace(0.001, 0.1, 300), np.geomspace(0.01, 1, 100)
+    figure = plotting.ood_detector({"BallRun": (known, random)})
+    line = labelled(figure.axes[0], "upper quarter: 'outside'").get_xdata()[0]
+    assert ((known > line).sum() + (random > line).sum()) == 100
+
+
+def test_values_are_drawn_where_they_are():
+    figure = plotting.against_truth([1.0, 2.0], {"a": [1.0, 2.0], "b": [0.5, 0.1]})
+    assert labelled(figure.axes[0], "b").get_xydata().tolist() == [[1, 0.5], [2, 0.1]]
+    figure = plotting.values_by_state({"a": np.array([1.0, 5.0]), "b": np.array([2.0, 2.0])})
+    assert figure.axes[0].lines[0].get_xydata().tolist() == [[0, 1], [1, 5]]
+    assert figure.axes[0].get_ylim()[1] > 5.3
+    figure = plotting.cost_of_limits(np.array([1.0, 2.0]), {"a": [0.5, np.nan], "b": [4.0, 3.0]})
+    assert labelled(figure.axes[0], "b").get_xydata().tolist() == [[1, 4], [2, 3]]
+    assert figure.axes[0].get_ylim() == pytest.approx((0, 4.4))
+
+
+def test_penalised_state_shows_a_mean_under_the_implicit_policy():
+    """Three actions as frequent; at kappa 0.75 the safe good one weighs three times each of the others."""
+    q, cost = [8.0, 2.0, -6.0], [5.0, 40.0, 60.0]
+    figure = plotting.penalised_state(q, cost, [1 / 3] * 3, limit=50, kappa=0.75)
+    costs, worth, policy = figure.axes
+    assert "= 5.2" in worth.get_title()  # (3 * 8 + 2 + 0) / 5: the unsafe one is lifted to zero
+    bars = sorted((bar.get_x() + 0.25, bar.get_height()) for bar in policy.patches if bar.get_width() == 0.5)
+    assert [height for _, height in bars] == pytest.approx([0.6, 0.2, 0.2])
+    assert "$V_c$ = 23.0" in policy.get_title() and "35.0" in policy.get_title()
+    everything = plotting.penalised_state(q, cost, [1 / 3] * 3, limit=1, kappa=0.75)
+    assert "$V_c$ = 35.0" in everything.axes[2].get_title()
+    with pytest.raises(ValueError, match="kappa"):
+        plotting.penalised_state(q, cost, [1 / 3] * 3, limit=1, kappa=1.0)

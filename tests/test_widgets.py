@@ -69,6 +69,19 @@ def test_every_part_of_algorithm_2_can_be_shown(lines, capsys):
     assert not [line for line in shown[1:] if line.startswith("# Line")]
 
 
+def test_penalty_sliders_draw_a_limit_and_an_expectile():
+    control = widgets.penalty_sliders(limit=40, kappa=0.7)
+    costs, worth, policy = control.result.axes
+    assert set(costs.lines[0].get_ydata()) == {40}
+    before = policy.get_title()
+    limit, kappa = control.kwargs_widgets
+    kappa.value = 0.95
+    assert control.result.axes[2].get_title() != before
+    limit.value = 6
+    assert set(control.result.axes[0].lines[0].get_ydata()) == {6}
+    assert repr(control) == "(Run the notebook for sliders: limit and kappa.)"
+
+
 def test_lines_that_no_comment_names_are_an_error():
     with pytest.raises(ValueError, match="Lines 1-2"):
         widgets.print_lines(C2IQL.losses, 1, 2)

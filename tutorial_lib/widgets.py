@@ -75,6 +75,26 @@ def head_error_slider(models, task, head: int = 2, error: float = 0.0) -> Contro
     )
 
 
+# A state with seven recorded actions: what they promise and are expected to cost, and how frequent they are.
+SEVEN_ACTIONS = (
+    (12.0, 30.0, 44.0, 52.0, 60.0, -14.0, 25.0),
+    (8.0, 22.0, 35.0, 41.0, 58.0, 50.0, 14.0),
+    (0.2, 0.2, 0.15, 0.15, 0.1, 0.1, 0.1),
+)
+
+
+def penalise(limit: float, kappa: float):
+    """Draws what a limit does to one state's actions, and the policy that an expectile implies there."""
+    return plotting.penalised_state(*SEVEN_ACTIONS, limit, kappa)
+
+
+def penalty_sliders(limit: int = 40, kappa: float = 0.7) -> Controls:
+    """`penalise` with sliders for the limit and for kappa."""
+    limits = ipywidgets.IntSlider(limit, 0, 60, 2, description="limit", **SLIDER)
+    kappas = ipywidgets.FloatSlider(value=kappa, min=0.5, max=0.99, step=0.01, description="kappa", **SLIDER)
+    return Controls(penalise, limit=limits, kappa=kappas)
+
+
 def print_lines(function, first: int, last: int | None = None) -> None:
     """Prints the paragraph of a function that its comment calls lines `first` to `last` (of Algorithm 2).
 

@@ -21,6 +21,7 @@ from torch import Tensor, nn
 
 from tutorial_lib import losses as L
 from tutorial_lib.algorithms.base import Agent, cost_guess, reward_guess
+from tutorial_lib.datasets import Dataset
 from tutorial_lib.discounting import average_threshold
 from tutorial_lib.networks import ActionDecoder, ActionEncoder, Critics, SquashedPolicy, latent_kl
 
@@ -105,9 +106,7 @@ class CPQ(Agent):
         limit = average_threshold(limit, config.gamma, self.task.horizon)
 
         # The conditional VAE of the recorded actions.
-        mean, log_std = net.encoder(s, a)
-        decoded = net.decoder(s, mean + log_std.exp() * latent_noise)
-        vae_loss = (decoded - a).square().mean() + KL_WEIGHT * latent_kl(mean, log_std).mean()
+        vae_loss = _vae_loss(net.encoder, net.decoder, s, a, latent_noise)
 
         # Eq. 3: what follows counts where the policy's action at s' looks safe. It may be outside the data.
         a_next = net.policy(s_next, next_noise)[0].detach()
@@ -154,3 +153,33 @@ class CPQ(Agent):
             kl = latent_kl(*net.encoder(states, actions))  # (10 B,)
         rows = kl.topk(round(OUTSIDE_SHARE * len(kl))).indices
         return states[rows], actions[rows]
+
+
+def latent_divergences(dataset: Dataset, updates: int = 400, width: int = 200, n: int = 2000, seed: int = 0):
+    """Would CPQ's VAE notice? The KL divergences (n,) that it gives recorded actions, and uniformly random
+    ones in the same states, after so many updates of its own loss at batch size 256.
+    """
+    data, generator = dataset.tensors(), torch.Generator().manual_seed(seed)
+    s = (data.observations - data.observations.mean(0)) / (data.observations.std(0) + 1e-3)
+    a, sizes = data.actions, (s.shape[1], data.actions.shape[1])
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        encoder, decoder = ActionEncoder(*sizes, width, 2), ActionDecoder(*sizes, width, 2)
+    optimiser = torch.optim.Adam([*encoder.parameters(), *decoder.parameters()], 1e-3)
+    for _ in range(updates):
+        rows = torch.randint(len(s), (256,), generator=generator)
+        noise = torch.randn(256, 2 * sizes[1], generator=generator)
+        optimiser.zero_grad()
+        _vae_loss(encoder, decoder, s[rows], a[rows], noise).backward()
+        optimiser.step()
+    rows = torch.randint(len(s), (n,), generator=generator)
+    random = 2 * torch.rand(n, sizes[1], generator=generator) - 1
+    with torch.no_grad():
+        return tuple(latent_kl(*encoder(s[rows], x)).numpy() for x in (a[rows], random))
+
+
+def _vae_loss(encoder, decoder, s: Tensor, a: Tensor, noise: Tensor) -> Tensor:
+    """Mean squared error of the decoded actions and KL divergence of the latent, both means over (B, ...)."""
+    mean, log_std = encoder(s, a)
+    decoded = decoder(s, mean + log_std.exp() * noise)
+    return (decoded - a).square().mean() + KL_WEIGHT * latent_kl(mean, log_std).mean()

@@ -10,5 +10,6 @@ from tutorial_lib.checks.claims import *
 from tutorial_lib.checks.cmdp import *
 from tutorial_lib.checks.discounting import *
 from tutorial_lib.checks.logs import *
+from tutorial_lib.checks.penalty import *
 from tutorial_lib.checks.reconstruction import *
 from tutorial_lib.checks.start import *

@@ -6,6 +6,7 @@ from tutorial_lib.plotting.cmdp import *
 from tutorial_lib.plotting.discounting import *
 from tutorial_lib.plotting.episodes import *
 from tutorial_lib.plotting.logs import *
+from tutorial_lib.plotting.penalty import *
 from tutorial_lib.plotting.reconstruction import *
 from tutorial_lib.plotting.results import *
 from tutorial_lib.plotting.studies import *
