@@ -1,6 +1,6 @@
 """How large must the reconstruction model be, and what noise should it train on? A CSV of measured errors.
 
-`python -m tutorial_lib.reconstruction_study` makes data/results/reconstruction.csv: half an hour on a busy machine.
+`python -m tutorial_lib.reconstruction_study` makes data/results/reconstruction.csv in about half an hour.
 """
 
 import dataclasses
