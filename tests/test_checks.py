@@ -128,11 +128,30 @@ def at_zero(mu, q, v, slope):
     return mu * ratio / (mu * ratio).sum()
 
 
+def rescaled_budget(limit, spent, t, horizon):
+    return (limit - spent) / (1 - t / horizon)
+
+
+def budget_backup(cmdp, then, dearest=0):
+    """As a loop over everything."""
+    now = np.zeros_like(then)
+    for b, s in np.ndindex(now.shape):
+        found = []
+        for a, cost in enumerate(cmdp.costs[s].astype(int)):
+            if cost <= b:
+                after = then[max(b - cost, 0)] if not dearest else then[b]
+                found.append(cmdp.rewards[s, a] + cmdp.transitions[s, a] @ after)
+        now[b, s] = max(found, default=0)
+    return now
+
+
 ANSWERS = {
     checks.check_run_cost: run_cost,
     checks.check_least_cost: least_cost,
     checks.check_implicit_policy: implicit_policy,
     checks.check_batched_loss: batched_loss,
+    checks.check_rescaled_budget: rescaled_budget,
+    checks.check_budget_backup: budget_backup,
     checks.check_keeps_limit: keeps_limit,
     checks.check_normalised_return: normalised_return,
     checks.check_implicit_cost_value: implicit_cost_value,
@@ -152,6 +171,12 @@ MISTAKES = [
     (checks.check_batched_loss, lambda w, q, v: (w * (q - v) ** 2).mean(), "two errors, not four"),
     (checks.check_batched_loss, lambda w, q, v: (w * (q - v[:, None]) ** 2).mean(), "its own weight"),
     (checks.check_batched_loss, lambda w, q, v: (w * (q[:, 0] - v) ** 2).sum(), "a mean over"),
+    (checks.check_rescaled_budget, lambda L, spent, t, T: (L - spent) * (T - t) / T, "on schedule"),
+    (checks.check_rescaled_budget, lambda L, spent, t, T: L * T / (T - t), "on schedule"),
+    (checks.check_rescaled_budget, lambda L, spent, t, T: max(L - spent, 0) * T / (T - t), "overspent"),
+    (checks.check_budget_backup, lambda cmdp, then: budget_backup(cmdp, then, 1), "then[b - c]"),
+    (checks.check_budget_backup, lambda cmdp, then: (cmdp.rewards + cmdp.transitions @ then[0]).max(1)[None],
+     "without a budget"),
     (checks.check_keeps_limit, lambda costs, limit: max(costs) <= limit, "expectation"),
     (checks.check_keeps_limit, lambda costs, limit: np.mean(costs) < limit, "at most"),
     (checks.check_keeps_limit, lambda costs, limit: np.median(costs) <= limit, "their mean is not"),

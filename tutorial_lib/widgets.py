@@ -7,8 +7,9 @@ widget; where no kernel runs (GitHub, the site), the static picture after the co
 import inspect
 
 import ipywidgets
+import numpy as np
 
-from tutorial_lib import plotting
+from tutorial_lib import laps, plotting
 from tutorial_lib.evaluation import rollout
 
 SLIDER = {"continuous_update": False, "style": {"description_width": "initial"}}
@@ -58,6 +59,21 @@ def shortcut_slider(limit: float = 1.0) -> Controls:
     """`shortcut` with a slider for the limit on the discounted cost, from 0, which none can keep."""
     limits = ipywidgets.FloatSlider(limit, min=0, max=2.75, step=0.05, description="limit", **SLIDER)
     return Controls(shortcut, limit=limits)
+
+
+def spend(config, limit: float, bias: float = 1.0):
+    """Notebook 07's agent under a limit: what the budget rule tells it, what it spends, what it earns."""
+    told = laps.told(config, limit)
+    found = laps.follow_rule(config, laps.policies(np.unique(told), bias), limit)
+    title = f"limit {limit:g}, bias {bias:g}: expected cost {found.cost:.1f}, return {found.reward:.2f}"
+    return plotting.budget_maps({title: (told, found.chances)}, [limit])
+
+
+def budget_slider(config, limit: float = 20, bias: float = 1.0) -> Controls:
+    """`spend` with a slider for the limit and one for the agent's bias: thrifty below one."""
+    limits = ipywidgets.IntSlider(limit, 0, 60, 5, description="limit", **SLIDER)
+    biases = ipywidgets.FloatSlider(bias, min=0.4, max=1.8, step=0.1, description="bias", **SLIDER)
+    return Controls(lambda limit, bias: spend(config, limit, bias), limit=limits, bias=biases)
 
 
 def filter_slider(dataset, task, limit: float = 30) -> Controls:

@@ -8,6 +8,7 @@ raises: it prints what is wrong, or OK.
 from tutorial_lib.checks.c2iql import *
 from tutorial_lib.checks.claims import *
 from tutorial_lib.checks.cmdp import *
+from tutorial_lib.checks.conditioning import *
 from tutorial_lib.checks.discounting import *
 from tutorial_lib.checks.logs import *
 from tutorial_lib.checks.penalty import *

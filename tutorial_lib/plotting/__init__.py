@@ -3,6 +3,7 @@ where it is the last value of a cell. One file per idea of the course.
 """
 
 from tutorial_lib.plotting.cmdp import *
+from tutorial_lib.plotting.conditioning import *
 from tutorial_lib.plotting.discounting import *
 from tutorial_lib.plotting.episodes import *
 from tutorial_lib.plotting.logs import *

@@ -4,6 +4,7 @@ S states, A actions, float64 throughout. A policy is an (S, A) array of probabil
 are discounted sums (eq. 2) unless a horizon is given; then they are the plain sums of eq. 1.
 """
 
+from tutorial_lib.tabular.budgets import *
 from tutorial_lib.tabular.cmdp import *
 from tutorial_lib.tabular.examples import *
 from tutorial_lib.tabular.implicit import *
