@@ -2,7 +2,7 @@
 
 The cell of a solution goes. Its exercise keeps its cell, where each `...` that a student is to replace
 becomes a raise that says so: whatever needs an unsolved exercise stops with its name, and its checker tells
-it too.
+it too. An exercise without a `...` is a faulty function to repair, and stays as it is.
 """
 
 import ast
@@ -16,30 +16,37 @@ from marks import END_SOLUTION, is_solution, remove_marks
 def without_solutions(notebook) -> None:
     """Take the solutions out of a notebook, and the outputs of their exercises, in place.
 
-    An exercise's cells go from the last one with a `...` to the solution. Raises ValueError for a solution
-    without an end, and for one without an exercise.
+    An exercise is the last cell with a `...`, or with a function that the solution defines anew, and what
+    stands between it and the solution. Raises ValueError for a solution without an end or an exercise.
     """
-    exercise, kept = [], []
+    since, kept = [], []
     for cell in notebook.cells:
         if is_solution(cell):
-            _close(exercise, cell)
-            exercise = []
+            _open_exercise(since, cell)
+            since = []
             continue
         kept.append(cell)
         if cell.cell_type == "code":
-            exercise = [cell] if _open_lines(cell.source) else exercise + [cell]
+            since.append(cell)
     notebook.cells = kept
     remove_marks(notebook)
 
 
-def _close(exercise, solution) -> None:
+def _open_exercise(cells, solution) -> None:
     if not solution.source.rstrip().endswith(END_SOLUTION):
         raise ValueError(f"no {END_SOLUTION!r} ends this cell:\n{solution.source}")
-    if not exercise or not _open_lines(exercise[0].source):
-        raise ValueError(f"no cell with a `...` to replace precedes this solution:\n{solution.source}")
-    exercise[0].source = _raise_where_left_open(exercise[0].source)
-    for cell in exercise:
+    solved = _functions(solution.source)
+    found = [n for n, cell in enumerate(cells) if _open_lines(cell.source) or _functions(cell.source) & solved]
+    if not found:
+        raise ValueError(f"no exercise precedes this solution:\n{solution.source}")
+    exercise = cells[found[-1]]
+    exercise.source = _raise_where_left_open(exercise.source)
+    for cell in cells[found[-1] :]:
         cell.outputs, cell.execution_count = [], None
+
+
+def _functions(source: str) -> set[str]:
+    return {node.name for node in ast.parse(source).body if isinstance(node, ast.FunctionDef)}
 
 
 def _open_lines(source: str) -> dict[int, tuple[int, str]]:
