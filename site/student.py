@@ -36,7 +36,9 @@ def _open_exercise(cells, solution) -> None:
     if not solution.source.rstrip().endswith(END_SOLUTION):
         raise ValueError(f"no {END_SOLUTION!r} ends this cell:\n{solution.source}")
     solved = _functions(solution.source)
-    found = [n for n, cell in enumerate(cells) if _open_lines(cell.source) or _functions(cell.source) & solved]
+    found = [
+        n for n, cell in enumerate(cells) if _open_lines(cell.source) or _functions(cell.source) & solved
+    ]
     if not found:
         raise ValueError(f"no exercise precedes this solution:\n{solution.source}")
     exercise = cells[found[-1]]
