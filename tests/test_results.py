@@ -6,9 +6,12 @@ import pytest
 
 from tutorial_lib import plotting
 from tutorial_lib.algorithms import ALGORITHMS
+from tutorial_lib.datasets import load_dataset
 from tutorial_lib.paper import CLAIMS, TABLE1, TABLE1_AVERAGES, TABLE1_STD, TABLE2, Claim
 from tutorial_lib.results import (
+    against,
     difference,
+    kept,
     load_results,
     options_of,
     over_seeds,
@@ -224,3 +227,72 @@ def test_without_rows_every_figure_says_that_nothing_was_run():
     for draw in (*draws, plotting.against_paper, plotting.promises):
         (ax,) = draw(empty).axes
         assert ax.texts[0].get_text() == "not run: no results to draw"
+
+
+# --- Against a base, and what was kept ---
+
+
+def test_against_a_base_every_other_variant_has_a_row():
+    groups = [({"crm": "mlp"}, 0.7, 0.9), ({"crm": "linear"}, 0.5, 0.95), ({"crm": "none"}, 0.7, 0.2)]
+    table = against(make_results(groups, noise=0.002), {"crm": "mlp"}).set_index("crm")
+    assert set(table.index) == {"linear", "none"}
+    assert table.loc["linear", "reward is"] == "lower" and table.loc["linear", "cost is"] == "higher"
+    assert table.loc["none", "cost is"] == "lower" and table.loc["none", "reward is"] == "undecided"
+    assert float(table.loc["linear", "reward"]) == pytest.approx(-0.2, abs=0.02)
+
+
+def test_kept_counts_agents_and_episodes_by_loop():
+    rng = np.random.default_rng(3)
+    results = make_results([({}, 0.5, 0.9), ({"algorithm": "CPQ"}, 0.5, 1.1)], episodes=4)
+    results["cost"] += rng.normal(0, 12, len(results))
+    table = kept(results).set_index("algorithm")
+    for name in ("C2IQL", "CPQ"):
+        part = results[results["algorithm"] == name]
+        agents = [
+            part[(part["seed"] == seed) & (part["threshold"] == limit)]["cost"].mean() <= limit
+            for seed in (0, 1, 2)
+            for limit in (30, 50, 70)
+        ]
+        episodes = [row["cost"] <= row["threshold"] for _, row in part.iterrows()]
+        assert table.loc[name, "agents and limits kept"] == pytest.approx(np.mean(agents))
+        assert table.loc[name, "episodes kept"] == pytest.approx(np.mean(episodes))
+
+
+# --- Luck ---
+
+
+def test_seeds_raise_one_false_alarm_in_twenty_and_episodes_many():
+    rng = np.random.default_rng(1)
+    found = plotting.simulated_intervals(3, 0.05, 2_000, rng)
+    by_episodes, by_seeds = (((x[:, 0] > 0) | (x[:, 1] < 0)).mean() for x in found)
+    assert by_seeds == pytest.approx(0.05, abs=0.015) and by_episodes > 0.5
+    same = plotting.simulated_intervals(3, 0.0, 2_000, rng)[0]  # runs that differ in nothing but episodes
+    assert ((same[:, 0] > 0) | (same[:, 1] < 0)).mean() == pytest.approx(0.05, abs=0.02)
+
+
+def test_the_best_checkpoint_flatters_by_the_expected_maximum():
+    scores = plotting.picked_checkpoints(10, 9)
+    assert scores[:, -1].mean() == pytest.approx(0.7, abs=0.005)
+    assert scores.max(1).mean() - 0.7 == pytest.approx(1.5388 * 0.05, abs=0.003)  # of ten normals, tabulated
+
+
+def test_pictures_of_luck_count_and_mark():
+    figure = plotting.false_alarms(3, 0.0)
+    counts = [int(ax.get_title().split(". ")[1].split(" of")[0]) for ax in figure.axes]
+    assert all(count <= 4 for count in counts)
+    left = plotting.lucky_checkpoints(30, 5).axes[0]
+    lines = lines_of(left)
+    assert lines["the best"].get_ydata()[0] == max(lines["evaluation"].get_ydata())
+    assert lines["the last"].get_ydata()[0] == lines["evaluation"].get_ydata()[-1]
+
+
+def test_room_left_shows_the_best_recorded_episode_within_each_limit():
+    data = load_dataset("BallRun")
+    figure = plotting.room_left(make_results([({}, 0.2, 0.9)], task="BallRun"))
+    best = [
+        max(r for r, c in zip(data.episode_returns, data.episode_costs, strict=True) if c <= limit)
+        for limit in (30, 50, 70)
+    ]
+    task = TASKS["BallRun"]
+    expected = [(r - task.min_return) / (task.max_return - task.min_return) for r in best]
+    assert lines_of(figure.axes[0])["best recorded"].get_ydata() == pytest.approx(expected)

@@ -111,3 +111,37 @@ def _judge(values: np.ndarray) -> dict:
     verdict = "agrees" if low > 0 else "contradicts" if high < 0 else "undecided"
     interval = "" if np.isnan(low) else f"{low:+.2f} to {high:+.2f}"
     return {"difference": f"{values.mean():+.2f}", "95% over seeds": interval, "ours": verdict}
+
+
+def against(results: pd.DataFrame, base: dict) -> pd.DataFrame:
+    """One row per task and variant other than `base`: what it changes, with intervals over seeds (paired).
+
+    A gain is a difference whose interval lies above zero, a loss one below; else it is undecided.
+    """
+    names, rows = list(base), []
+    for key, part in results.groupby(["task", *names], sort=False, dropna=False):
+        variant = dict(zip(names, key[1:], strict=True))
+        if variant == base:
+            continue
+        of_task, row = results[results["task"] == key[0]], {"task": key[0]} | variant
+        for score, word in zip(SCORES, ("reward", "cost"), strict=True):
+            values = difference(of_task, score, variant, base)
+            low, high = seed_interval(values)
+            row[word] = f"{values.mean():+.2f}" if len(values) else "not run"
+            row[f"{word}, 95%"] = "" if np.isnan(low) else f"{low:+.2f} to {high:+.2f}"
+            row[f"{word} is"] = "higher" if low > 0 else "lower" if high < 0 else "undecided"
+        rows.append(row | {"seeds": part["seed"].nunique()})
+    return pd.DataFrame(rows)
+
+
+def kept(results: pd.DataFrame) -> pd.DataFrame:
+    """By task and algorithm: mean normalised cost; shares of (seed, limit) and of episodes that keep it."""
+    scores, by = with_scores(results), ["task", "algorithm"]
+    agents = scores.groupby([*by, "seed", "threshold"], sort=False)["cost_score"].mean().le(1)
+    episodes = scores.assign(kept=scores["cost_score"].le(1)).groupby(by, sort=False)["kept"].mean()
+    columns = {
+        "mean cost": over_seeds(results).set_index(by)["cost_score"],
+        "agents and limits kept": agents.groupby(by, sort=False).mean(),
+        "episodes kept": episodes,
+    }
+    return pd.DataFrame(columns).reset_index()

@@ -111,6 +111,20 @@ def penalty_sliders(limit: int = 40, kappa: float = 0.7) -> Controls:
     return Controls(penalise, limit=limits, kappa=kappas)
 
 
+def seeds_slider(seeds: int = 3, spread: float = 0.05) -> Controls:
+    """`plotting.false_alarms` with sliders for the number of seeds and how much runs differ by luck."""
+    counts = ipywidgets.IntSlider(seeds, 2, 10, 1, description="seeds", **SLIDER)
+    spreads = ipywidgets.FloatSlider(spread, min=0.0, max=0.1, step=0.01, description="spread", **SLIDER)
+    return Controls(plotting.false_alarms, seeds=counts, spread=spreads)
+
+
+def checkpoint_slider(checkpoints: int = 20, episodes: int = 5) -> Controls:
+    """`plotting.lucky_checkpoints` with sliders for the number of checkpoints and of episodes at each."""
+    counts = ipywidgets.IntSlider(checkpoints, 1, 80, 1, description="checkpoints", **SLIDER)
+    played = ipywidgets.IntSlider(episodes, 1, 40, 1, description="episodes", **SLIDER)
+    return Controls(plotting.lucky_checkpoints, checkpoints=counts, episodes=played)
+
+
 def print_lines(function, first: int, last: int | None = None) -> None:
     """Prints the paragraph of a function that its comment calls lines `first` to `last` (of Algorithm 2).
 

@@ -14,3 +14,4 @@ from tutorial_lib.checks.logs import *
 from tutorial_lib.checks.penalty import *
 from tutorial_lib.checks.reconstruction import *
 from tutorial_lib.checks.start import *
+from tutorial_lib.checks.studies import *

@@ -70,7 +70,7 @@ def variants(results):
         limits = sorted(part["threshold"].unique())
         for ax, (score, title, _) in zip(row, PANELS, strict=True):
             for index, name in enumerate(names):
-                shift = (index - (len(names) - 1) / 2) * 0.6 / len(names)
+                shift = (index - (len(names) - 1) / 2) * 0.4 / len(names)
                 _seeds_by(ax, part[part["variant"] == name], "threshold", limits, score, index, shift, name)
             ax.set_xticks(range(len(limits)), [f"{limit:g}" for limit in limits])
             ax.set_title(f"{task}: {title}")
@@ -227,7 +227,7 @@ def promises(results):
             rows = part[part["threshold"] == limit]
             style = {"color": COST, "alpha": alpha, "markersize": 9, "label": f"{name} limit"}
             ax.plot(rows["predicted_cost"], rows["cost"], mark, **style)
-            ax.axhline(limit, color=LIMIT, linestyle=":", linewidth=1)
+            ax.axhline(limit, color=LIMIT, linestyle=":", linewidth=1, label="the limits")
         ax.set(title=task, xlabel="predicted cost", xlim=(0, end), ylim=(0, end))
         ax.locator_params(nbins=4)
     axes[0, 0].set_ylabel("paid cost")
