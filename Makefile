@@ -31,10 +31,12 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
 
-# The site is built beside links to what the notebooks' own links lead to.
+# The site is built beside links to what the notebooks' own links lead to; what is a page of it is copied.
 course: $(READY) $(EXECUTED)
 	@rm -rf build/site $(filter-out $(EXECUTED),$(wildcard build/pages/notebooks/*))
-	@cp site/*.md build/pages && ln -sfn ../../data ../../tutorial_lib build/pages
+	@rm -rf build/pages/data && mkdir build/pages/data && ln -sfn ../../tutorial_lib build/pages
+	@ln -s $(patsubst %,../../../%,$(filter-out data/README.md,$(wildcard data/*))) build/pages/data
+	@cp data/README.md build/pages/data && cp site/*.md build/pages
 	@$(BIN) -m sphinx -q -W --keep-going -c site build/pages build/site
 	@echo "The course lies at $(CURDIR)/build/site/index.html: open it in a browser."
 

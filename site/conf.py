@@ -17,7 +17,7 @@ project = "Safe offline reinforcement learning with C2IQL"
 html_title = project
 copyright = "2026, the C2IQL tutorial authors"
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.mathjax", "sphinx-mathjax-offline"]
-exclude_patterns = ["data", "tutorial_lib"]
+exclude_patterns = ["tutorial_lib"]
 
 nb_execution_mode = "off"  # the Makefile has executed them
 nb_output_stderr = "remove"

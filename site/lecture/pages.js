@@ -3,9 +3,11 @@
 // nbconvert makes a slide of all that stands between two slide marks, often several screens of it. Here it is
 // taken apart into blocks (a paragraph, a table, a cell's code, an output) which fill page after page. Within
 // a page, each cell's code and each of its outputs waits for a key: there is time to predict. A block that is
-// taller than a page is made smaller; a table, a little, and then it is cut between its rows.
+// taller or wider than a page is made smaller; a table, a little, and then it is cut between its rows.
 
-const WIDTH = 1280, HEIGHT = 720, ROOM = HEIGHT - 40;
+const WIDTH = 1280;
+const HEIGHT = 720;
+const ROOM = HEIGHT - 40;
 
 window.MathJax = {
   tex: { inlineMath: [["$", "$"], ["\\(", "\\)"]], displayMath: [["$$", "$$"], ["\\[", "\\]"]], tags: "ams" },
@@ -42,6 +44,7 @@ function blocksOf(slide) {
       blocks.push({ node: make("div", "output", ...output.childNodes), step: ++step });
     }
   }
+  if (blocks.length) blocks[0].fresh = true;
   return blocks;
 }
 
@@ -57,6 +60,11 @@ function splitTable(page, table) {
 
 function shrink(page, node, least) {
   for (let zoom = 1; page.scrollHeight > ROOM && zoom >= least; zoom -= 0.02) node.style.zoom = zoom;
+}
+
+function narrow(page, node) {
+  const wide = node.querySelector('mjx-container[display="true"]') || node;
+  for (let zoom = 1; page.scrollWidth > WIDTH && zoom >= 0.3; zoom -= 0.02) wide.style.zoom = zoom;
 }
 
 // Fills pages with blocks; returns them as a list of slides, each a list of pages.
@@ -86,6 +94,7 @@ function paginate(blocks, stage) {
     else if (block.fresh) turn(false);
     if (block.heading) title = block.node.textContent;
     put(block);
+    narrow(page, block.node);
     if (page.scrollHeight <= ROOM) continue;
     const table = block.node.tagName === "TABLE";
     const enoughAbove = used.some((other) => other !== block && !other.heading);
@@ -115,11 +124,11 @@ async function present() {
   await Promise.all([...document.images].map((image) => image.decode().catch(() => {})));
 
   const deck = document.querySelector(".reveal .slides");
-  const parts = [...deck.children].map(blocksOf);
+  const blocks = [...deck.children].flatMap(blocksOf);
   const stage = make("section", "stage");
   deck.replaceChildren(stage);
   deck.style.width = `${WIDTH}px`;
-  const slides = parts.flatMap((blocks) => paginate(blocks, stage));
+  const slides = paginate(blocks, stage);
   deck.style.width = "";
   deck.replaceChildren(...slides.map((pages) => make("section", "", ...pages)));
 
