@@ -125,6 +125,13 @@ def checkpoint_slider(checkpoints: int = 20, episodes: int = 5) -> Controls:
     return Controls(plotting.lucky_checkpoints, checkpoints=counts, episodes=played)
 
 
+def expectile_slider(values, kappa: float = 0.7) -> Controls:
+    """`plotting.expectile_of` with a slider for kappa."""
+    options = [0.1, 0.3, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.97, 0.99, 0.999]
+    kappas = ipywidgets.SelectionSlider(options=options, value=kappa, description="kappa", **SLIDER)
+    return Controls(lambda kappa: plotting.expectile_of(values, kappa), kappa=kappas)
+
+
 def print_lines(function, first: int, last: int | None = None) -> None:
     """Prints the paragraph of a function that its comment calls lines `first` to `last` (of Algorithm 2).
 

@@ -10,6 +10,7 @@ from tutorial_lib.checks.claims import *
 from tutorial_lib.checks.cmdp import *
 from tutorial_lib.checks.conditioning import *
 from tutorial_lib.checks.discounting import *
+from tutorial_lib.checks.iql import *
 from tutorial_lib.checks.logs import *
 from tutorial_lib.checks.penalty import *
 from tutorial_lib.checks.reconstruction import *

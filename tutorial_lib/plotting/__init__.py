@@ -8,6 +8,7 @@ from tutorial_lib.plotting.discounting import *
 from tutorial_lib.plotting.episodes import *
 from tutorial_lib.plotting.logs import *
 from tutorial_lib.plotting.luck import *
+from tutorial_lib.plotting.ood import *
 from tutorial_lib.plotting.penalty import *
 from tutorial_lib.plotting.reconstruction import *
 from tutorial_lib.plotting.results import *

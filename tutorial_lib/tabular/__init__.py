@@ -7,5 +7,6 @@ are discounted sums (eq. 2) unless a horizon is given; then they are the plain s
 from tutorial_lib.tabular.budgets import *
 from tutorial_lib.tabular.cmdp import *
 from tutorial_lib.tabular.examples import *
+from tutorial_lib.tabular.general import *
 from tutorial_lib.tabular.implicit import *
 from tutorial_lib.tabular.optimal import *
