@@ -54,7 +54,7 @@ def false_alarms(seeds: int = 3, spread: float = 0.05):
         )
         ax.set_xticks([])
     axes[0].set_ylabel("difference in score")
-    axes[0].set_ylim(-0.3, 0.3)
+    axes[0].set_ylim(-0.35, 0.35)
     return figure
 
 

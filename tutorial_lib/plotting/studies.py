@@ -202,7 +202,10 @@ def per_limit(results):
         axes[2 * block, column].set_title(task)
         axes[2 * block + 1, column].plot([0, limits.max()], [0, limits.max()], **DASHED, label="cost = limit")
         axes[2 * block + 1, column].set(xlabel="limit", ylim=(0, None))
+    returns = results.groupby(["task", "algorithm", "threshold"])["reward_score"].mean()
     for block in range(blocks):
+        for ax in axes[2 * block]:
+            ax.set_ylim(min(0, returns.min() - 0.05), max(1, returns.max()) + 0.05)
         axes[2 * block, 0].set_ylabel("normalised return")
         axes[2 * block + 1, 0].set_ylabel("cost paid")
     for ax in axes[2 * (blocks - 1) :].T[len(tasks) - columns * (blocks - 1) :].flat:
