@@ -29,7 +29,7 @@ function blocksOf(slide) {
   let step = 0;
   for (const cell of slide.querySelectorAll(".jp-Cell")) {
     const markdown = cell.querySelector(".jp-RenderedMarkdown");
-    if (markdown) {
+    if (markdown && cell.classList.contains("jp-MarkdownCell")) {
       step += 1;
       for (const node of [...markdown.children]) {
         const heading = /^H[123]$/.test(node.tagName);
@@ -41,7 +41,10 @@ function blocksOf(slide) {
     const code = cell.querySelector(".jp-InputArea-editor");
     if (code) blocks.push({ node: make("div", "code", ...code.childNodes), step: ++step, fresh: solution });
     for (const output of cell.querySelectorAll(".jp-OutputArea-child")) {
-      blocks.push({ node: make("div", "output", ...output.childNodes), step: ++step });
+      const text = output.querySelector(".jp-RenderedMarkdown");  // a table that code made
+      const parts = text ? [...text.children] : [make("div", "output", ...output.childNodes)];
+      step += 1;
+      for (const node of parts) blocks.push({ node, step });
     }
   }
   if (blocks.length) blocks[0].fresh = true;
