@@ -165,7 +165,11 @@ class Slow:
             if self.name != "IQL":
                 critics = [k[0] for k in self.call("target", "cost_critics", s, a)]
                 cost, q_cost = max((self.cost(heads), heads) for heads in critics)
-                if cost > limit:
+                if config.unsafe_price is not None:
+                    price = config.unsafe_price * self.state["reward_scale"].item() / TASK.cost_range
+                    state_cost = self.cost(self.call("online", "cost_value", s)[0])
+                    q -= price * (max(cost - limit, 0) - max(state_cost - limit, 0))
+                elif cost > limit:
                     q = 0.0
                 add("safe_fraction", cost <= limit)
             u = q - v
@@ -210,6 +214,7 @@ OPTIONS = [
     {"time_limits": "mask"},
     {"reward_time_limits": "mask"},
     {"cost_kappa": 0.95},
+    {"unsafe_price": 0.5},
     {"cost_critics": 1},
     {"cost_critics": 3},
     {"kappa_1": 0.5, "kappa_2": 0.6, "gamma": 0.7},
@@ -219,7 +224,7 @@ OPTIONS = [
 @pytest.mark.parametrize("options", OPTIONS, ids=str)
 @pytest.mark.parametrize("name", FAMILY)
 def test_an_updates_losses_are_algorithm_2s(name, options):
-    if name == "CIQL" and ("cost_kappa" in options or "time_limits" in options):
+    if name == "CIQL" and "time_limits" in options:
         pytest.skip("CIQL is the paper's and has no such option")
     agent = make_agent(name, seeds=(0, 1), **options)
     batch, limits = random_batch(1, runs=2), random_limits(2, runs=2)

@@ -20,6 +20,7 @@ CAR_RUN = TASKS["CarRun"]  # thresholds 10, 20, 40; cost range 40: infinity's co
 def test_threshold_set_is_appendix_b2s():
     assert threshold_set(CAR_RUN).tolist() == [10, 20, 40, math.inf]
     assert threshold_set(TASKS["AntCircle"]).tolist() == [40, 100, 160, math.inf]
+    assert threshold_set(CAR_RUN, with_zero=True).tolist() == [0, 10, 20, 40, math.inf]
 
 
 def test_encode_counts_in_cost_ranges():
@@ -92,6 +93,11 @@ def test_nearest_threshold_with_infinity_at_its_code():
     # Halfway between 40 and infinity's 60 lies 50.
     nearest = nearest_threshold(BUDGETS, CAR_RUN, with_infinite=True)
     assert nearest.tolist() == [10] * 5 + [20] * 2 + [40] * 2 + [math.inf] * 3
+
+
+def test_nearest_threshold_with_zero_below_half_of_the_smallest():
+    nearest = nearest_threshold([-1e9, 0, 4.9, 5.1, 14.9, 15.1, 1e9], CAR_RUN, with_zero=True)
+    assert nearest.tolist() == [0] * 3 + [10] * 2 + [20, 40]
 
 
 def test_nearest_threshold_keeps_the_shape():

@@ -76,7 +76,8 @@ def budget_rule(limit, spent, t, task, config):
     budget = left if config.time_limits == "mask" else left * task.horizon / steps_left
     if config.infinite_at_test == "covered" and left >= steps_left:
         return math.inf
-    places = {float(threshold): threshold for threshold in task.thresholds}
+    zero = (0.0,) if config.zero_threshold else ()  # halfway between two, the smaller is told
+    places = {float(threshold): threshold for threshold in (*zero, *task.thresholds)}
     if config.infinite_at_test == "nearest":
         places[math.inf] = 1.5 * task.cost_range
     if budget == math.inf:
@@ -86,8 +87,10 @@ def budget_rule(limit, spent, t, task, config):
 
 @pytest.mark.parametrize("infinite", ["covered", "nearest", "never"])
 @pytest.mark.parametrize("time_limits", ["rate", "mask"])
-def test_every_step_is_that_of_a_loop_by_hand_under_the_budget_rule(time_limits, infinite):
-    agent = make_agent(seeds=(0, 1), time_limits=time_limits, infinite_at_test=infinite)
+@pytest.mark.parametrize("zero", [False, True])
+def test_every_step_is_that_of_a_loop_by_hand_under_the_budget_rule(time_limits, infinite, zero):
+    options = {"time_limits": time_limits, "infinite_at_test": infinite, "zero_threshold": zero}
+    agent = make_agent(seeds=(0, 1), **options)
     limits, seeds, run = [0.0, 30.0, 35.5, 50.0, 100.0, math.inf], [11, 12, 13, 14, 15, 16], 1
     played = rollout(agent, limits, seeds, run)
     envs = [make_env("BallRun") for _ in seeds]

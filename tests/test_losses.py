@@ -108,10 +108,16 @@ def test_penalised_q_by_hand():
     limit = torch.tensor([10.0, 10.0, 10.0, 10.0, 10.0, math.inf])
     # The limit itself is allowed. A negative Q of an unsafe action becomes zero, a reward: the paper's rule.
     assert L.penalised_q(q, cost, limit).tolist() == [5.0, 5.0, 0.0, -5.0, 0.0, 5.0]
-    # Keeping half its Q and paying 2 per unit of excess: 2.5 - 0.2 and -2.5 - 2.
-    assert L.penalised_q(q, cost, limit, 0.5, 2.0).tolist() == pytest.approx(
-        [5.0, 5.0, 2.3, -5.0, -4.5, 5.0], rel=1e-5
-    )
+
+
+def test_priced_q_by_hand():
+    q = torch.full((6,), 5.0)
+    cost = torch.tensor([9.0, 12.0, 12.0, 9.0, 12.0, 1e9])
+    state_cost = torch.tensor([8.0, 9.0, 13.0, 14.0, 12.0, 1.0])
+    limit = torch.tensor([10.0, 10.0, 10.0, 10.0, 10.0, math.inf])
+    # At a price of 3 an excess of 2 pays 6, and a state's excess of 1, 3 and 4 gives 3, 9 and 12 back.
+    expected = [5.0, 5.0 - 6.0, 5.0 - 6.0 + 9.0, 5.0 + 12.0, 5.0, 5.0]
+    assert L.priced_q(q, cost, state_cost, limit, 3.0).tolist() == expected
 
 
 def test_td_target_by_hand():

@@ -10,9 +10,9 @@ INFINITE_CODE = 1.5
 """Paper silent: an infinite threshold enters the networks as 1.5 cost ranges, above every finite one."""
 
 
-def threshold_set(task: Task) -> np.ndarray:
-    """The set {small, middle, high, infinity} of Appendix B.2, (4,)."""
-    return np.array([*task.thresholds, math.inf])
+def threshold_set(task: Task, with_zero: bool = False) -> np.ndarray:
+    """The set {small, middle, high, infinity} of Appendix B.2, (4,), or with a zero before them, (5,)."""
+    return np.array([*([0.0] if with_zero else []), *task.thresholds, math.inf])
 
 
 def encode(threshold, task: Task) -> np.ndarray:
@@ -38,13 +38,13 @@ def rescaled_budget(limit, spent, t: int, horizon: int) -> np.ndarray:
     return (np.asarray(limit, float) - spent) * horizon / (horizon - t)
 
 
-def nearest_threshold(budget, task: Task, with_infinite: bool = False) -> np.ndarray:
+def nearest_threshold(budget, task: Task, with_infinite: bool = False, with_zero: bool = False) -> np.ndarray:
     """The element of the threshold set closest to each budget.
 
     A budget below the smallest threshold, or negative, gets the smallest; one above the largest, the
     largest. With `with_infinite`, infinity stands where its code does, at 1.5 cost ranges.
     """
-    choices = threshold_set(task) if with_infinite else np.asarray(task.thresholds, float)
+    choices = threshold_set(task, with_zero)[: None if with_infinite else -1]
     places = np.where(np.isinf(choices), INFINITE_CODE * task.cost_range, choices)
     budget = np.clip(np.asarray(budget, float), places[0], places[-1])  # infinity is as far from all
     distance = np.abs(budget[..., None] - places)

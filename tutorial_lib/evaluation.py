@@ -44,7 +44,9 @@ def condition(agent: Agent, limit: np.ndarray, spent: np.ndarray, t: int) -> np.
         budget = limit - spent
     else:
         budget = rescaled_budget(limit, spent, t, task.horizon)
-    chosen = nearest_threshold(budget, task, with_infinite=config.infinite_at_test == "nearest")
+    chosen = nearest_threshold(
+        budget, task, with_infinite=config.infinite_at_test == "nearest", with_zero=config.zero_threshold
+    )
     if config.infinite_at_test == "covered":
         chosen = np.where(limit - spent >= task.horizon - t, np.inf, chosen)
     return chosen

@@ -24,17 +24,21 @@ def expectile_loss(target: Tensor, value: Tensor, kappa: float) -> Tensor:
     return (expectile_weight(advantage, kappa).detach() * advantage.square()).mean()
 
 
-def penalised_q(
-    q_reward: Tensor, cost: Tensor, limit: Tensor, unsafe_share: float = 0.0, price: float = 0.0
-) -> Tensor:
-    """Eq. 11: Q_{r|c} = 1(cost <= limit) Q_r; all (B,). An infinite limit penalises nothing.
+def penalised_q(q_reward: Tensor, cost: Tensor, limit: Tensor) -> Tensor:
+    """Eq. 11: Q_{r|c} = 1(cost <= limit) Q_r; all (B,). An infinite limit penalises nothing."""
+    return torch.where(cost <= limit, q_reward, 0.0)
 
-    The paper's unsafe action is worth zero, whatever it earns and however much it costs. It may instead keep
-    a share of its Q_r and pay a price per unit of excess: then unsafe actions are ranked, also where all are.
+
+def priced_q(
+    q_reward: Tensor, cost: Tensor, state_cost: Tensor, limit: Tensor, price: Tensor | float
+) -> Tensor:
+    """Ours: Q_r - price (excess of the action - excess of its state) over the limit; all (B,).
+
+    Under eq. 11 all unsafe actions are worth the same, nothing. Here they are ranked, as by a Lagrange
+    multiplier that acts beyond the limit only. The state's excess ranks nothing, but without it V_r would add
+    up payments along the episode that no action can avoid.
     """
-    safe = cost <= limit
-    excess = torch.where(safe, 0.0, cost - limit)
-    return torch.where(safe, q_reward, unsafe_share * q_reward - price * excess)
+    return q_reward - price * ((cost - limit).clamp(min=0.0) - (state_cost - limit).clamp(min=0.0))
 
 
 def td_target(reward: Tensor, gamma: Tensor | float, next_value: Tensor, mask: Tensor) -> Tensor:

@@ -85,10 +85,10 @@ def train(
 
 def _warn_of_negative_q(agent: Agent, log: list[dict]) -> None:
     share = max((row.get("negative_q", 0.0) for row in log[-len(agent.seeds) :]), default=0.0)
-    if share > 0.01 and agent.config.unsafe_share == 0 and not agent.config.shift_rewards:
+    if share > 0.01 and agent.config.unsafe_price is None and not agent.config.shift_rewards:
         warnings.warn(
             f"{share:.0%} of Q_r are negative: the zero penalty rewards unsafe actions there; "
-            "try shift_rewards=True, or unsafe_share and unsafe_price",
+            "try shift_rewards=True, or an unsafe_price",
             stacklevel=3,
         )
 

@@ -14,10 +14,15 @@ import torch
 from torch import Tensor, nn
 from torch.func import functional_call, stack_module_state, vmap
 
+from tutorial_lib import losses as L
 from tutorial_lib.conditioning import check_threshold
 from tutorial_lib.config import Config
 from tutorial_lib.datasets import Batch, Dataset
+from tutorial_lib.discounting import mean_return_to_go
 from tutorial_lib.tasks import Task
+
+MEASURED = ("observation_mean", "observation_std", "reward_scale")
+"""What an agent measures on its dataset before the first update, and saves with its networks."""
 
 
 class Agent:
@@ -56,6 +61,7 @@ class Agent:
 
         self.observation_mean = torch.zeros(task.obs_dim, device=self.device)
         self.observation_std = torch.ones(task.obs_dim, device=self.device)
+        self.reward_scale = torch.tensor(reward_guess(task, config), device=self.device)
         runs = [self._build_seeded(seed) for seed in self.seeds]
         self.modules = {name: copy.deepcopy(net).to("meta") for name, net in runs[0].items()}
         self.parameters = {name: stack_module_state([run[name] for run in runs])[0] for name in self.modules}
@@ -104,6 +110,7 @@ class Agent:
         if self.config.normalise_observations:
             self.observation_mean = self._tensor(dataset.observations.mean(0))
             self.observation_std = self._tensor(dataset.observations.std(0)) + 1e-3
+        self.reward_scale = self._tensor(abs(mean_return_to_go(dataset, self.config.gamma)))
 
     def draw_limits(self, generator: torch.Generator, batch_size: int) -> Tensor:
         """The cost limits of one run's batch, (B,)."""
@@ -129,6 +136,13 @@ class Agent:
         if self.config.reward_time_limits == "mask":
             ends = torch.maximum(ends, batch.timeouts)
         return 1 - ends
+
+    def penalised_q(self, q_reward: Tensor, cost: Tensor, state_cost: Tensor, limit: Tensor) -> Tensor:
+        """Eq. 11, or our variant with a price; costs and limit are those of an episode, all (B,)."""
+        if self.config.unsafe_price is None:
+            return L.penalised_q(q_reward, cost, limit)
+        price = self.config.unsafe_price * self.reward_scale / self.task.cost_range
+        return L.priced_q(q_reward, cost, state_cost, limit, price)
 
     # What they all share ----------------------------------------------------------------------------
 
@@ -192,7 +206,8 @@ class Agent:
         tensors |= {f"target.{n}.{k}": v for n, p in self.target_parameters.items() for k, v in p.items()}
         for index, moments in self.optimiser.state_dict()["state"].items():
             tensors |= {f"adam.{index}.{key}": value for key, value in moments.items()}
-        tensors |= {"observation_mean": self.observation_mean, "observation_std": self.observation_std}
+        for name in MEASURED:
+            tensors[name] = getattr(self, name)
         return tensors | {"updates": torch.tensor(self.updates)}
 
     def load_state(self, tensors: dict[str, Tensor]) -> None:
@@ -213,8 +228,8 @@ class Agent:
                 _, index, moment = key.split(".")
                 state["state"].setdefault(int(index), {})[moment] = value
         self.optimiser.load_state_dict(state)
-        self.observation_mean.copy_(tensors["observation_mean"])
-        self.observation_std.copy_(tensors["observation_std"])
+        for name in MEASURED:
+            getattr(self, name).copy_(tensors[name])
         self.updates = int(tensors["updates"])
 
     def __getstate__(self):

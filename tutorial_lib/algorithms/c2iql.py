@@ -54,7 +54,8 @@ class C2IQL(Agent):
         """Line 5. Paper silent on 'per batch' or 'per sample': per sample has the lower variance."""
         if not self.conditioned:
             return super().draw_limits(generator, batch_size)
-        choices = torch.as_tensor(threshold_set(self.task), dtype=torch.float32)
+        choices = threshold_set(self.task, with_zero=self.config.zero_threshold)
+        choices = torch.as_tensor(choices, dtype=torch.float32)
         draws = batch_size if self.config.thresholds_per == "sample" else 1
         return choices[torch.randint(len(choices), (draws,), generator=generator)].expand(batch_size)
 
@@ -88,9 +89,9 @@ class C2IQL(Agent):
         q_cost = q_cost.take_along_dim(worst[None, :, None], 0).squeeze(0)  # (B, m)
 
         # Lines 9-10: constraint penalisation.
-        price = config.unsafe_price * self.modules["value"].scale / self.task.cost_range
         q_reward = net.target_critics(s, a).amin(0)
-        q = L.penalised_q(q_reward, cost, limit, config.unsafe_share, price)
+        v_cost = net.cost_value(s)  # (B, m)
+        q = self.penalised_q(q_reward, cost, self.episode_cost(v_cost.detach()), limit)
 
         # Lines 11-12: value function.
         v = net.value(s)
@@ -98,7 +99,6 @@ class C2IQL(Agent):
 
         # Lines 13-14: cost value function, under the implicit policy of the line above.
         weight = L.expectile_weight(q - v, config.kappa_1 if config.cost_kappa is None else config.cost_kappa)
-        v_cost = net.cost_value(s)
         cost_value_loss = L.cost_value_loss(weight, q_cost, v_cost)
 
         # Lines 15-16: Q-value function.

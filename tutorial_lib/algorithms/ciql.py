@@ -28,16 +28,19 @@ class CIQL(Agent):
         config, a = self.config, batch.actions
         s, s_next = (self.network_input(x, limit) for x in (batch.observations, batch.next_observations))
         mask = 1 - batch.terminals  # bootstrap through time limits, stop where the robot fell
-        average_limit = average_threshold(limit, config.gamma, self.task.horizon)
+        share = average_threshold(1.0, config.gamma, self.task.horizon)  # L~ / L (eq. 2)
 
         q_cost = net.target_cost_critics(s, a).amax(0)  # (B, 1)
+        cost = q_cost[:, 0] / share  # so it is compared with L: the same as Q_c with L~
         q_reward = net.target_critics(s, a).amin(0)
-        q = L.penalised_q(q_reward, q_cost[:, 0], average_limit)  # eq. 11
+        v_cost = net.cost_value(s)  # (B, 1)
+        q = self.penalised_q(q_reward, cost, v_cost[:, 0].detach() / share, limit)  # eq. 11
         v = net.value(s)
         value_loss = L.expectile_loss(q, v, config.kappa_1)  # eq. 12
 
-        weight = L.expectile_weight(q - v, config.kappa_1)  # Theorem 1
-        cost_value_loss = L.cost_value_loss(weight, q_cost, net.cost_value(s))  # eq. 17
+        cost_kappa = config.kappa_1 if config.cost_kappa is None else config.cost_kappa
+        weight = L.expectile_weight(q - v, cost_kappa)  # Theorem 1
+        cost_value_loss = L.cost_value_loss(weight, q_cost, v_cost)  # eq. 17
 
         target = L.td_target(batch.rewards, config.gamma, net.value(s_next), self.reward_mask(batch))
         critic_loss = L.td_loss(target, net.critics(s, a))
@@ -57,7 +60,7 @@ class CIQL(Agent):
             "policy": policy_loss,
         }
         return losses, {
-            "safe_fraction": (q_cost[:, 0] <= average_limit).float().mean(),
+            "safe_fraction": (cost <= limit).float().mean(),
             "value_mean": v.mean(),
             "negative_q": (q_reward < 0).float().mean(),
         }

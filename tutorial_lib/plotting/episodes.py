@@ -192,6 +192,7 @@ def _draw_condition(ax, played: Rollout, e: int, limit: float, task: Task):
     given = np.where(np.isinf(played.conditions[steps, e]), top, played.conditions[steps, e])
     ax.step(steps, given, where="post", color=LIMIT, label="threshold given")
     infinite = np.isinf(played.conditions[steps, e]).any()
-    ticks = [*task.thresholds, *([top] if infinite else [])]
-    ax.set_yticks(ticks, [*map("{:g}".format, task.thresholds), *(["∞"] if infinite else [])])
-    ax.set(ylabel="threshold", ylim=(0, 1.1 * (top if infinite else task.cost_range)))
+    finite = sorted({*task.thresholds, *given[given < top]})
+    ticks = [*finite, *([top] if infinite else [])]
+    ax.set_yticks(ticks, [*map("{:g}".format, finite), *(["∞"] if infinite else [])])
+    ax.set(ylabel="threshold", ylim=(-2, 1.1 * (top if infinite else task.cost_range)))
