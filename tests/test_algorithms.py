@@ -11,6 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from randoms import random_batch, randomise
 from torch.func import functional_call
 
 from tutorial_lib.algorithms import ALGORITHMS, get_algorithm
@@ -69,31 +70,6 @@ def make_agent(name, seeds=(0,), task=TASK, **changes):
     fixed = kind.constrained and not kind.conditioned
     config = dataclasses.replace(CONFIG, **changes)
     return kind(task, config, seeds=seeds, threshold=LIMIT if fixed else None)
-
-
-def randomise(agent, seed=0):
-    """Random numbers in every tensor, so that online and target networks, and both runs, all differ."""
-    generator = torch.Generator().manual_seed(seed)
-    state = {key: value.clone() for key, value in agent.state().items()}
-    for value in state.values():
-        if value.is_floating_point():
-            value.copy_(0.5 * torch.randn(value.shape, generator=generator))
-    state["observation_std"] = 0.5 + state["observation_std"].abs()
-    agent.load_state(state)
-
-
-def random_batch(seed, runs=1):
-    rng = np.random.default_rng(seed)
-    fields = {
-        "observations": rng.normal(size=(runs, B, 3)),
-        "actions": rng.uniform(-1, 1, size=(runs, B, 2)),
-        "rewards": rng.normal(2, 4, size=(runs, B)),
-        "costs": rng.random((runs, B)) < 0.5,
-        "next_observations": rng.normal(size=(runs, B, 3)),
-        "terminals": rng.random((runs, B)) < 0.3,
-        "timeouts": rng.random((runs, B)) < 0.3,
-    }
-    return Batch(**{key: torch.tensor(value, dtype=torch.float32) for key, value in fields.items()})
 
 
 def random_limits(seed, runs=1):

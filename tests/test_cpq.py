@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from randoms import random_batch, randomise
 from torch.func import functional_call
 
 from tutorial_lib import training
@@ -38,31 +39,6 @@ NETWORKS_OF = {  # which networks a loss trains
 
 def make_agent(seeds=(0,), threshold=LIMIT, **changes):
     return CPQ(TASK, dataclasses.replace(CONFIG, **changes), seeds=seeds, threshold=threshold)
-
-
-def randomise(agent, seed):
-    """Random numbers in every tensor, so that online and target networks, and the runs, all differ."""
-    generator = torch.Generator().manual_seed(seed)
-    state = {key: value.clone() for key, value in agent.state().items()}
-    for value in state.values():
-        if value.is_floating_point():
-            value.copy_(0.5 * torch.randn(value.shape, generator=generator))
-    state["observation_std"] = 0.5 + state["observation_std"].abs()
-    agent.load_state(state)
-
-
-def random_batch(seed, runs=1):
-    rng = np.random.default_rng(seed)
-    fields = {
-        "observations": rng.normal(size=(runs, B, OBS)),
-        "actions": rng.uniform(-1, 1, size=(runs, B, ACT)),
-        "rewards": rng.normal(2, 4, size=(runs, B)),
-        "costs": rng.random((runs, B)) < 0.5,
-        "next_observations": rng.normal(size=(runs, B, OBS)),
-        "terminals": rng.random((runs, B)) < 0.3,
-        "timeouts": rng.random((runs, B)) < 0.3,
-    }
-    return Batch(**{key: torch.tensor(value, dtype=torch.float32) for key, value in fields.items()})
 
 
 # --- The equations as loops ---
@@ -157,7 +133,7 @@ class Slow:
 
 @pytest.mark.parametrize("seeds", [(4,), (4, 9)])
 def test_an_updates_losses_are_cpqs(seeds):
-    agent, batch = make_agent(seeds), random_batch(1, len(seeds))
+    agent, batch = make_agent(seeds), random_batch(1, len(seeds), size=B)
     noises = [agent.draw_noise(torch.Generator().manual_seed(seed), B) for seed in seeds]
     for seed in range(50):  # until safe and unsafe actions are there, or the batch shows nothing
         randomise(agent, seed)
@@ -195,7 +171,7 @@ def losses_and_leaves(agent, change=None):
     for name in agent.frozen:
         values = {key: value.detach() for key, value in leaves[name].items()}
         setattr(net, f"frozen_{name}", bound(name, values))
-    batch = Batch(*(field[0] for field in random_batch(1)))
+    batch = Batch(*(field[0] for field in random_batch(1, size=B)))
     noise = agent.draw_noise(torch.Generator().manual_seed(0), B)
     return agent.losses(net, batch, torch.full((B,), LIMIT), *noise)[0], leaves
 
@@ -235,7 +211,7 @@ def test_the_multiplier_takes_a_plain_step_and_stays_within_its_bounds():
     for start, cost, expected in ((0.3, 2.0, None), (5.0, 0.0, 5.0), (-5.0, 90.0, -5.0)):
         log.data.fill_(start)
         agent.fill_last_bias(("cost_critics",), cost)
-        scalars = agent.update(random_batch(1, runs=2), generators)
+        scalars = agent.update(random_batch(1, runs=2, size=B), generators)
         for run in (0, 1):
             missing = 1.5 * LIMIT * sum(0.8**t for t in range(T)) / T - scalars["outside_cost"][run].item()
             step = start + 1e-4 * math.exp(start) * missing if expected is None else expected
@@ -243,7 +219,7 @@ def test_the_multiplier_takes_a_plain_step_and_stays_within_its_bounds():
             assert (missing > 0) == (cost == 0.0)
     log.data.fill_(5.0)
     agent.fill_last_bias(("cost_critics",), 90.0)
-    agent.update(random_batch(1, runs=2), generators)
+    agent.update(random_batch(1, runs=2, size=B), generators)
     assert (log < 5.0).all()  # a bound can be left
 
 
@@ -281,7 +257,7 @@ def test_each_run_draws_its_noise_from_its_own_generator():
     draw = agent.draw_noise
     agent.draw_noise = lambda *args: seen.append(draw(*args)) or seen[-1]
     generators = [torch.Generator().manual_seed(seed) for seed in (3, 4)]
-    agent.update(random_batch(0, runs=2), generators)
+    agent.update(random_batch(0, runs=2, size=B), generators)
     assert [x.shape for x in seen[0]] == [(B, 2 * ACT), (B, ACT), (10, B, ACT)]
     for seed, noises in zip((3, 4), seen, strict=True):
         alone = draw(torch.Generator().manual_seed(seed), B)

@@ -12,7 +12,6 @@ from tutorial_lib.discounting import (
     average_threshold,
     cost_sequences,
     discounted_sums,
-    mean_return_to_go,
     misjudged,
     random_cost_sequences,
     settled_share,
@@ -86,15 +85,6 @@ def test_an_episode_cut_short_costs_nothing_more():
     fell = ends & (np.arange(7) == 3)
     dataset = Dataset(zeros, zeros, zeros, zeros[:, 0], costs, fell, ends & ~fell)
     np.testing.assert_array_equal(cost_sequences(dataset, 4), [[1, 0, 1, 0], [1, 0, 0, 0], [0, 2.5, 1, 0]])
-
-
-def test_mean_return_to_go_is_its_loop():
-    rewards = np.array([1, -2, 3, 4, 5, 6, -7], np.float32)  # episodes of 3, 1 and 3 steps
-    ends, zeros = np.isin(np.arange(7), (2, 3, 6)), np.zeros((7, 1), np.float32)
-    dataset = Dataset(zeros, zeros, zeros, rewards, rewards * 0, ends & False, ends)
-    to_go = [sum(0.9**k * r for k, r in enumerate(episode[t:]))
-             for episode in ([1, -2, 3], [4], [5, 6, -7]) for t in range(len(episode))]  # fmt: skip
-    assert mean_return_to_go(dataset, 0.9) == pytest.approx(np.mean(to_go), rel=1e-6)
 
 
 @pytest.mark.parametrize(("gamma", "tau"), [(0.9, 0.1), (0.99, 0.005), (0.5, 1.0)])

@@ -103,6 +103,15 @@ def test_returns_to_go_against_a_double_loop():
             assert found[row] == pytest.approx(expected, abs=1e-5)
 
 
+def test_their_mean_over_all_states_against_a_loop_over_episodes():
+    rewards = np.array([1, -2, 3, 4, 5, 6, -7], np.float32)  # episodes of 3, 1 and 3 steps
+    ends, zeros = np.isin(np.arange(7), (2, 3, 6)), np.zeros((7, 1), np.float32)
+    dataset = Dataset(zeros, zeros, zeros, rewards, rewards * 0, ends & False, ends)
+    to_go = [sum(0.9**k * r for k, r in enumerate(episode[t:]))
+             for episode in ([1, -2, 3], [4], [5, 6, -7]) for t in range(len(episode))]  # fmt: skip
+    assert logs.returns_to_go(dataset, 0.9).mean() == pytest.approx(np.mean(to_go), rel=1e-6)
+
+
 def test_within_looks_ahead_and_not_into_the_next_episode():
     data = recordings(np.random.default_rng(2))
     for steps in (1, 3):

@@ -169,14 +169,14 @@ def study(
         out: the CSV to write; default data/results/NAME.csv, and in a trial runs/studies/NAME.csv.
         dry: only list the cells, and which of them are finished.
     """
-    from tutorial_lib import cells, engine, studies  # pulls in dask
+    from tutorial_lib import cells, engine, results, studies  # pulls in dask
 
     record, folder = studies.get_study(name), runs / name
     changes = (*option, *(() if steps is None else (f"steps={steps}",)))
     settings = {"change": lambda config: with_options(config, changes), "profile": profile, "data": data}
     grid, chosen = studies.cells(record, **settings), studies.cells(record, only, **settings)
     trial = bool(changes) or profile != "small" or data != "shipped"
-    out = out or (runs / f"{name}.csv" if trial else studies.RESULTS / f"{name}.csv")
+    out = out or (runs / f"{name}.csv" if trial else results.RESULTS / f"{name}.csv")
     print(record.question)
     if dry:
         for cell in chosen:

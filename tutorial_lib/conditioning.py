@@ -42,7 +42,8 @@ def nearest_threshold(budget, task: Task, with_infinite: bool = False, with_zero
     """The element of the threshold set closest to each budget.
 
     A budget below the smallest threshold, or negative, gets the smallest; one above the largest, the
-    largest. With `with_infinite`, infinity stands where its code does, at 1.5 cost ranges.
+    largest. With `with_infinite`, infinity stands where its code does, at 1.5 cost ranges; with `with_zero`,
+    0 is the smallest.
     """
     choices = threshold_set(task, with_zero)[: None if with_infinite else -1]
     places = np.where(np.isinf(choices), INFINITE_CODE * task.cost_range, choices)

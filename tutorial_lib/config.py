@@ -85,6 +85,11 @@ class Config:
     shift_rewards: bool = False
     """Train on rewards minus their dataset minimum. The zero penalty punishes only where Q_r > 0."""
 
+    @property
+    def evaluated_kappa(self) -> float:
+        """The expectile of the implicit policy whose cost V_c learns."""
+        return self.kappa_1 if self.cost_kappa is None else self.cost_kappa
+
 
 PROFILES: dict[str, Config] = {"paper": Config()}
 PROFILES["small"] = dataclasses.replace(

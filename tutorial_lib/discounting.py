@@ -38,15 +38,6 @@ def settled_share(gamma, updates, tau: float):
     return 1 - (1 - tau * (1 - np.asarray(gamma))) ** np.asarray(updates)
 
 
-def mean_return_to_go(dataset: Dataset, gamma: float) -> float:
-    """Mean over all N recorded states of the discounted return from there to the episode's end.
-
-    A reward t steps into its episode counts once for each state up to it: sum of gamma^k for k = 0 ... t.
-    """
-    t = np.arange(len(dataset.rewards)) - dataset.starts[dataset.episode_index]
-    return float((dataset.rewards * (1 - gamma ** (t + 1)) / (1 - gamma)).mean())
-
-
 class Misjudged(NamedTuple):
     """Shares of all sequences (Fig. 1): safe but rejected, and unsafe but accepted."""
 

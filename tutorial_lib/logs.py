@@ -1,6 +1,7 @@
 """What recordings can teach, before anything is trained: frontiers, filters, coverage, time limits."""
 
 import numpy as np
+from scipy.signal import lfilter  # the recursion y_t = x_t + gamma y_(t+1), compiled
 
 from tutorial_lib.datasets import Dataset
 
@@ -64,8 +65,8 @@ def returns_to_go(dataset: Dataset, gamma: float, after_timeout=0.0) -> np.ndarr
     totals = np.empty(len(dataset))
     for start, end, tail in zip(dataset.starts, dataset.ends, tails, strict=True):
         following = 0.0 if dataset.terminals[end - 1] else float(tail)
-        for row in range(end - 1, start - 1, -1):
-            following = totals[row] = dataset.rewards[row] + gamma * following
+        backwards = np.asarray(dataset.rewards[start:end][::-1], np.float64)
+        totals[start:end][::-1] = lfilter([1.0], [1.0, -gamma], backwards, zi=[gamma * following])[0]
     return totals
 
 

@@ -14,10 +14,8 @@ from pathlib import Path
 from tutorial_lib.algorithms import get_algorithm
 from tutorial_lib.cells import Cell
 from tutorial_lib.config import Config, get_profile
-from tutorial_lib.datasets import SHIPPED_DATA, find_dataset, load_dataset, shipped_tasks
+from tutorial_lib.datasets import find_dataset, load_dataset, shipped_tasks
 from tutorial_lib.tasks import get_task
-
-RESULTS = SHIPPED_DATA / "results"
 
 
 @dataclass(frozen=True)

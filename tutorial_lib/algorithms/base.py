@@ -18,7 +18,7 @@ from tutorial_lib import losses as L
 from tutorial_lib.conditioning import check_threshold
 from tutorial_lib.config import Config
 from tutorial_lib.datasets import Batch, Dataset
-from tutorial_lib.discounting import mean_return_to_go
+from tutorial_lib.logs import returns_to_go
 from tutorial_lib.tasks import Task
 
 MEASURED = ("observation_mean", "observation_std", "reward_scale")
@@ -110,7 +110,7 @@ class Agent:
         if self.config.normalise_observations:
             self.observation_mean = self._tensor(dataset.observations.mean(0))
             self.observation_std = self._tensor(dataset.observations.std(0)) + 1e-3
-        self.reward_scale = self._tensor(abs(mean_return_to_go(dataset, self.config.gamma)))
+        self.reward_scale = self._tensor(abs(returns_to_go(dataset, self.config.gamma).mean()))
 
     def draw_limits(self, generator: torch.Generator, batch_size: int) -> Tensor:
         """The cost limits of one run's batch, (B,)."""
@@ -137,12 +137,12 @@ class Agent:
             ends = torch.maximum(ends, batch.timeouts)
         return 1 - ends
 
-    def penalised_q(self, q_reward: Tensor, cost: Tensor, state_cost: Tensor, limit: Tensor) -> Tensor:
-        """Eq. 11, or our variant with a price; costs and limit are those of an episode, all (B,)."""
+    def penalised_q(self, q_reward: Tensor, cost: Tensor, value_cost: Tensor, limit: Tensor) -> Tensor:
+        """Eq. 11, or our variant with a price: Q_r, episode cost and limit (B,), and V_c's heads (B, m)."""
         if self.config.unsafe_price is None:
             return L.penalised_q(q_reward, cost, limit)
         price = self.config.unsafe_price * self.reward_scale / self.task.cost_range
-        return L.priced_q(q_reward, cost, state_cost, limit, price)
+        return L.priced_q(q_reward, cost, self.episode_cost(value_cost.detach()), limit, price)
 
     # What they all share ----------------------------------------------------------------------------
 

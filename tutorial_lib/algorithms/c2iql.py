@@ -91,14 +91,14 @@ class C2IQL(Agent):
         # Lines 9-10: constraint penalisation.
         q_reward = net.target_critics(s, a).amin(0)
         v_cost = net.cost_value(s)  # (B, m)
-        q = self.penalised_q(q_reward, cost, self.episode_cost(v_cost.detach()), limit)
+        q = self.penalised_q(q_reward, cost, v_cost, limit)
 
         # Lines 11-12: value function.
         v = net.value(s)
         value_loss = L.expectile_loss(q, v, config.kappa_1)
 
         # Lines 13-14: cost value function, under the implicit policy of the line above.
-        weight = L.expectile_weight(q - v, config.kappa_1 if config.cost_kappa is None else config.cost_kappa)
+        weight = L.expectile_weight(q - v, config.evaluated_kappa)
         cost_value_loss = L.cost_value_loss(weight, q_cost, v_cost)
 
         # Lines 15-16: Q-value function.

@@ -24,22 +24,24 @@ class CIQL(Agent):
             "policy": Policy(task.obs_dim, task.act_dim, config),
         }
 
+    def episode_cost(self, q_cost):
+        """Discounted costs (..., 1) over L~ / L (eq. 2), (...,): comparing them with L is Q_c against L~."""
+        return q_cost.squeeze(-1) / average_threshold(1.0, self.config.gamma, self.task.horizon)
+
     def losses(self, net, batch, limit):
         config, a = self.config, batch.actions
         s, s_next = (self.network_input(x, limit) for x in (batch.observations, batch.next_observations))
         mask = 1 - batch.terminals  # bootstrap through time limits, stop where the robot fell
-        share = average_threshold(1.0, config.gamma, self.task.horizon)  # L~ / L (eq. 2)
 
         q_cost = net.target_cost_critics(s, a).amax(0)  # (B, 1)
-        cost = q_cost[:, 0] / share  # so it is compared with L: the same as Q_c with L~
+        cost = self.episode_cost(q_cost)
         q_reward = net.target_critics(s, a).amin(0)
         v_cost = net.cost_value(s)  # (B, 1)
-        q = self.penalised_q(q_reward, cost, v_cost[:, 0].detach() / share, limit)  # eq. 11
+        q = self.penalised_q(q_reward, cost, v_cost, limit)  # eq. 11
         v = net.value(s)
         value_loss = L.expectile_loss(q, v, config.kappa_1)  # eq. 12
 
-        cost_kappa = config.kappa_1 if config.cost_kappa is None else config.cost_kappa
-        weight = L.expectile_weight(q - v, cost_kappa)  # Theorem 1
+        weight = L.expectile_weight(q - v, config.evaluated_kappa)  # Theorem 1
         cost_value_loss = L.cost_value_loss(weight, q_cost, v_cost)  # eq. 17
 
         target = L.td_target(batch.rewards, config.gamma, net.value(s_next), self.reward_mask(batch))

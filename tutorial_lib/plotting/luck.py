@@ -5,6 +5,8 @@ from matplotlib import ticker
 
 from tutorial_lib.datasets import load_dataset
 from tutorial_lib.evaluation import normalised_return, with_scores
+from tutorial_lib.logs import best_left
+from tutorial_lib.plotting.studies import algorithm_looks
 from tutorial_lib.plotting.style import (
     COST,
     DASHED,
@@ -94,17 +96,16 @@ def room_left(results):
     scored = with_scores(results)
     tasks = list(scored["task"].unique())
     figure, axes = subplots(1, len(tasks), figsize=(max(12, 3 * len(tasks)), 4.4), sharey=True, squeeze=False)
-    looks = {"C2IQL": ("D-", REWARD), "BC-Safe": ("^-", "#009E73")}
+    looks = algorithm_looks(scored)
     for ax, name in zip(axes[0], tasks, strict=True):
         task, data = get_task(name), load_dataset(name)
-        scores = normalised_return(data.episode_returns, task)
-        best = [scores[data.episode_costs <= limit].max() for limit in task.thresholds]
+        best = normalised_return(best_left(data, task.thresholds)[1], task)
         ax.plot(range(3), best, "_", color=LIMIT, markersize=40, markeredgewidth=3, label="best recorded")
-        for algorithm, (mark, colour) in looks.items():
+        for algorithm in ("C2IQL", "BC-Safe"):
             part = scored[(scored["task"] == name) & (scored["algorithm"] == algorithm)]
             means = part.groupby("threshold")["reward_score"].mean().reindex(task.thresholds)
             if means.notna().any():
-                ax.plot(range(3), means, mark, color=colour, markersize=9, linewidth=1.5, label=algorithm)
+                ax.plot(range(3), means, **looks[algorithm], linewidth=1.5, label=algorithm)
         ax.set_xticks(range(3), [f"{limit:g}" for limit in task.thresholds])
         ax.set(title=name, xlabel="limit", xlim=(-0.5, 2.5))
     axes[0, 0].set(ylabel="normalised return", ylim=(0, None))

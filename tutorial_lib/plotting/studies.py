@@ -176,12 +176,18 @@ def _interval_and_dots(ax, x, dots, colour, label):
     ax.errorbar(x, dots.mean(), bars, fmt="D", color=colour, markersize=9, capsize=6, label=label)
 
 
+def algorithm_looks(results) -> dict[str, dict]:
+    """How each algorithm is drawn, by its place in the results: the same in every figure made of them."""
+    looks = zip(results["algorithm"].unique(), VARIANTS, MARKS, strict=False)
+    return {name: {"color": colour, "marker": mark, "markersize": 8} for name, colour, mark in looks}
+
+
 @one_figure
 @or_not_run
 def per_limit(results):
     """The paper's Fig. 2: return and cost at each limit, a column for each task, a line per algorithm."""
     results = with_scores(results)
-    tasks, names = list(results["task"].unique()), list(results["algorithm"].unique())
+    tasks, looks = list(results["task"].unique()), algorithm_looks(results)
     columns = min(4, len(tasks))
     blocks = -(-len(tasks) // columns)
     size = (12, 5.6 * blocks + 0.6)
@@ -192,9 +198,8 @@ def per_limit(results):
         limits = np.array(sorted(part["threshold"].unique()))
         means = part.groupby(["algorithm", "threshold"])[["reward_score", "cost"]].mean()
         for ax, score in zip(axes[2 * block : 2 * block + 2, column], ("reward_score", "cost"), strict=True):
-            for index, name in enumerate(names):
+            for name, style in looks.items():
                 if name in means.index.get_level_values(0):
-                    style = {"color": VARIANTS[index], "marker": MARKS[index], "markersize": 8}
                     ax.plot(
                         limits, means.loc[name, score].reindex(limits), **style, linewidth=1.5, label=name
                     )
