@@ -1,8 +1,7 @@
-"""Sliders in a real browser: JupyterLab runs a whole notebook, a key moves a slider, the picture changes."""
+"""Every slider of every notebook in a real browser: in JupyterLab a key moves it, and the picture changes."""
 
 import json
 import os
-import shutil
 import socket
 import subprocess
 import sys
@@ -10,7 +9,9 @@ import time
 import urllib.request
 from pathlib import Path
 
+import nbformat
 import pytest
+from controls import WIDGET, cut
 
 ROOT = Path(__file__).parents[1]
 TOKEN = "course"
@@ -22,7 +23,9 @@ KERNEL = "window.jupyterapp.shell.currentWidget?.sessionContext?.session?.kernel
 CELLS = """() => window.jupyterapp.shell.currentWidget.content.model.sharedModel.cells
     .filter(cell => cell.cell_type == "code")
     .map(cell => [cell.execution_count, cell.outputs.map(output => output.output_type)])"""
-NOTEBOOK = "00_start_here.ipynb"
+END_KERNEL = "window.jupyterapp.shell.currentWidget.sessionContext.shutdown()"
+ERRORS = "[data-mime-type='application/vnd.jupyter.error'], [data-mime-type='application/vnd.jupyter.stderr']"
+NOTEBOOKS = sorted(ROOT.glob("notebooks/*.ipynb"))
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +45,8 @@ def lab(browser, tmp_path_factory):
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps(content))
     (folder / "work").mkdir()
-    shutil.copy(ROOT / "notebooks" / NOTEBOOK, folder / "work")
+    for path in NOTEBOOKS:
+        nbformat.write(cut(nbformat.read(path, as_version=4)), folder / "work" / path.name)
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
@@ -74,10 +78,12 @@ def _wait_until_it_answers(url, server, log):
     raise TimeoutError(log.read_text())
 
 
-def test_a_key_moves_the_slider_and_the_picture_changes(lab, browser):
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_a_key_moves_every_slider_and_the_picture_changes(lab, browser, path):
+    """There and back again: the picture that comes back is the first, to the byte."""
     page = browser.new_page(viewport={"width": 1280, "height": 900})
     page.set_default_timeout(90_000)
-    page.goto(f"{lab}/doc/tree/{NOTEBOOK}?token={TOKEN}")
+    page.goto(f"{lab}/doc/tree/{path.name}?token={TOKEN}")
     page.wait_for_function(f"{KERNEL} == 'idle'")
     page.evaluate("window.jupyterapp.commands.execute('notebook:run-all-cells')")
     page.wait_for_function(f"({CELLS})().every(([count]) => count) && {KERNEL} == 'idle'")
@@ -85,21 +91,56 @@ def test_a_key_moves_the_slider_and_the_picture_changes(lab, browser):
     assert [count for count, _ in cells] == list(range(1, len(cells) + 1))
     assert not [kinds for _, kinds in cells if "error" in kinds]
 
-    control = page.locator(".widget-interact").first
-    picture, number = control.locator("img"), control.locator(".widget-readout").first
-    picture.wait_for()
-    before, limit = picture.get_attribute("src"), number.inner_text()
-    assert len(before) > 10_000
-    control.locator(".noUi-handle").first.focus()
-    page.keyboard.press("ArrowRight")
-    _wait_for_another(page, picture, before)
-    assert number.inner_text() != limit
+    controls = page.locator(".widget-interact")
+    assert controls.count() == len(cells) - 1 >= 1
+    for control in controls.all():
+        sliders = control.locator(".widget-inline-hbox")
+        assert 1 <= sliders.count() == control.locator(".noUi-handle").count(), "a control that is no slider"
+        for slider in sliders.all():
+            _move_and_back(page, slider, control.locator("img"))
+    assert not page.locator(ERRORS).all_inner_texts()
+    page.evaluate(END_KERNEL)
     page.close()
 
 
-def _wait_for_another(page, picture, before):
-    for _ in range(180):
-        if picture.count() and picture.get_attribute("src") != before:
+def _move_and_back(page, slider, picture):
+    handle, number = slider.locator(".noUi-handle"), slider.locator(".widget-readout")
+    picture.wait_for()
+    before, value = picture.get_attribute("src"), number.inner_text()
+    assert len(before) > 10_000
+    keys = ["ArrowRight", "ArrowLeft"]
+    if handle.get_attribute("aria-valuenow") == handle.get_attribute("aria-valuemax"):
+        keys.reverse()
+    handle.focus()
+    page.keyboard.press(keys[0])
+    _wait_until(page, picture, lambda src: src != before, f"moved from {value}, the picture stays as it was")
+    assert number.inner_text() != value
+    page.keyboard.press(keys[1])
+    _wait_until(page, picture, lambda src: src == before, f"back at {value}, the picture is another")
+    assert number.inner_text() == value
+
+
+def _wait_until(page, picture, is_right, complaint):
+    for _ in range(900):
+        if picture.count() and is_right(picture.get_attribute("src")):
             return
-        page.wait_for_timeout(500)
-    raise AssertionError("the slider was moved, and the picture stayed as it was")
+        page.wait_for_timeout(100)
+    raise AssertionError(complaint)
+
+
+TOY = {
+    "import math\nimport os\nmath.floor(0.5)": "import math",
+    "step = 1\nfactor = 2\n\n\n@staticmethod\ndef twice(x):\n    return factor * x * math.pi":
+        "factor = 2\n@staticmethod\ndef twice(x):\n    return factor * x * math.pi",
+    "unused = twice(3)": "",
+    "step = [5]\nstep += [1]\nstep[0] = 4": "step = [5]\nstep += [1]\nstep[0] = 4",
+    "show(lambda: twice(step))": "show(lambda: twice(step))",
+    "step = 0": "",
+}  # fmt: skip
+
+
+def test_a_cut_keeps_what_a_control_needs_and_no_more():
+    notebook = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(source) for source in TOY])
+    notebook.cells[4].outputs = [nbformat.v4.new_output("display_data", {WIDGET: {}})]
+    *before, control, _ = TOY.values()
+    assert [cell.source for cell in cut(notebook).cells] == ["\n".join(filter(None, before)), control]
