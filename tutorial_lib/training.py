@@ -17,6 +17,7 @@ from tqdm.auto import tqdm
 from tutorial_lib.algorithms import Agent, get_algorithm
 from tutorial_lib.config import Config
 from tutorial_lib.datasets import Batch, Dataset, sample_batch
+from tutorial_lib.products import Precision, products
 from tutorial_lib.tasks import get_task
 
 CHECKPOINT = "checkpoint.safetensors"
@@ -36,48 +37,51 @@ def train(
     checkpoint_every: int = 2_500,
     on_checkpoint: Callable[[Agent], None] | None = None,
     progress: bool = True,
+    precision: Precision = "float32",
 ) -> list[dict]:
     """Train all runs of `agent` until it has made `steps` updates (default: its config's). Returns the log.
 
     With a `run_dir`, scalars go to metrics.csv and everything needed to go on to checkpoint.safetensors,
     every `checkpoint_every` updates; called again on the same folder, it continues from there, bit for bit
     on the same machine. Each run samples with a generator of its own, seeded by its seed, so its batches
-    do not depend on which seeds train beside it. Raises TrainingError when a loss is NaN or infinite.
+    do not depend on which seeds train beside it. `precision` is that of matrix products on the CPU. Raises
+    TrainingError when a loss is NaN or infinite.
     """
     steps = agent.config.steps if steps is None else steps
     generators = [torch.Generator().manual_seed(seed) for seed in agent.seeds]
     agent.data_checksum = dataset.checksum
     log = _resume(agent, generators, run_dir) if run_dir and (run_dir / CHECKPOINT).exists() else []
     dataset = agent.select_episodes(dataset)
-    if not agent.updates:
-        agent.prepare(dataset, progress)
-    data = _training_data(dataset, agent)
-    bar = tqdm(
-        total=steps,
-        initial=agent.updates,
-        desc=agent.name,
-        unit="update",
-        disable=not progress,
-        mininterval=0.5,
-    )
-    started, first = time.perf_counter(), agent.updates
-    while agent.updates < steps:
-        batch = sample_batch(data, agent.config.batch_size, generators)
-        scalars = agent.update(batch, generators)
-        bar.update()
-        last = agent.updates == steps
-        logs = last or agent.updates % log_every == 0
-        saves = run_dir and (last or agent.updates % checkpoint_every == 0)
-        if logs or saves:  # what is not finite must not reach a checkpoint either
-            rows = _rows(agent, scalars, (agent.updates - first) / (time.perf_counter() - started))
-            _check_finite(rows)
-        if logs:
-            log += rows
-            bar.set_postfix(_summary(scalars))
-        if saves:
-            save_checkpoint(agent, generators, log, run_dir)
-            if on_checkpoint:
-                on_checkpoint(agent)
+    with products(precision):
+        if not agent.updates:
+            agent.prepare(dataset, progress)
+        data = _training_data(dataset, agent)
+        bar = tqdm(
+            total=steps,
+            initial=agent.updates,
+            desc=agent.name,
+            unit="update",
+            disable=not progress,
+            mininterval=0.5,
+        )
+        started, first = time.perf_counter(), agent.updates
+        while agent.updates < steps:
+            batch = sample_batch(data, agent.config.batch_size, generators)
+            scalars = agent.update(batch, generators)
+            bar.update()
+            last = agent.updates == steps
+            logs = last or agent.updates % log_every == 0
+            saves = run_dir and (last or agent.updates % checkpoint_every == 0)
+            if logs or saves:  # what is not finite must not reach a checkpoint either
+                rows = _rows(agent, scalars, (agent.updates - first) / (time.perf_counter() - started))
+                _check_finite(rows)
+            if logs:
+                log += rows
+                bar.set_postfix(_summary(scalars))
+            if saves:
+                save_checkpoint(agent, generators, log, run_dir)
+                if on_checkpoint:
+                    on_checkpoint(agent)
     bar.close()
     _warn_of_negative_q(agent, log)
     return log
