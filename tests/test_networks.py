@@ -5,9 +5,10 @@ import math
 import pytest
 import torch
 from torch import nn
+from torch.func import stack_module_state, vmap
 
 from tutorial_lib.config import Config
-from tutorial_lib.networks import Critics, EnsembleLinear, Policy, Value, gaussian_log_prob, mlp
+from tutorial_lib.networks import Borrower, Critics, EnsembleLinear, Policy, Value, gaussian_log_prob, mlp
 
 CONFIG = Config(hidden_width=16, hidden_layers=2)
 B, OBS, ACT = 5, 7, 2
@@ -148,3 +149,22 @@ def test_a_seed_names_a_network():
     first, again, other = build(1), build(1), build(2)
     assert all(torch.equal(first[key], again[key]) for key in first)
     assert not any(torch.equal(first[key], other[key]) for key in first)
+
+
+@pytest.mark.parametrize("runs", [1, 3])
+def test_a_borrower_computes_with_what_it_is_lent(runs):
+    """As torch.func.functional_call does, gradients too, for one set of parameters or for several at once."""
+    s, a = torch.randn(runs, B, OBS), torch.randn(runs, B, ACT)
+    nets = [Critics(OBS, ACT, CONFIG, SCALES) for _ in range(runs)]
+    parameters, _ = stack_module_state(nets)
+    borrower = Borrower(nets[0])
+    found = vmap(lambda p, *x: borrower.lend(p)(*x))(parameters, s, a)
+    expected = torch.stack([net(*x) for net, *x in zip(nets, s, a, strict=True)])
+    torch.testing.assert_close(found, expected)
+    weight = parameters["layers.0.weight"]
+    (gradient,) = torch.autograd.grad(found.square().sum(), weight)
+    own = [net.layers[0].weight for net in nets]
+    torch.testing.assert_close(gradient, torch.stack(torch.autograd.grad(expected.square().sum(), own)))
+    plain = {key: value[-1] for key, value in parameters.items()}
+    torch.testing.assert_close(borrower.lend(plain)(s[0], a[0]), nets[-1](s[0], a[0]))
+    assert not list(borrower.module.parameters()) and len(list(nets[0].parameters())) == len(plain)

@@ -19,6 +19,7 @@ from tutorial_lib.conditioning import check_threshold
 from tutorial_lib.config import Config
 from tutorial_lib.datasets import Batch, Dataset
 from tutorial_lib.logs import returns_to_go
+from tutorial_lib.networks import Borrower
 from tutorial_lib.tasks import Task
 
 MEASURED = ("observation_mean", "observation_std", "reward_scale")
@@ -80,6 +81,9 @@ class Agent:
             ],
             fused=True,
         )
+        self.borrowers = {name: Borrower(net) for name, net in self.modules.items()}
+        self.borrowers |= {f"target_{name}": Borrower(self.modules[name]) for name in self.targets}
+        self.borrowers |= {f"frozen_{name}": Borrower(self.modules[name]) for name in self.frozen}
         self.updates = 0
         self.data_checksum: str | None = None  # of the dataset that it was trained on
 
@@ -197,8 +201,8 @@ class Agent:
 
     def network(self, name: str, run: int = 0) -> Callable[..., Tensor]:
         """One network of one run, to be called."""
-        own = {key: value[run] for key, value in self.parameters[name].items()}
-        return _bind(self.modules[name], _detached(own))
+        own = {key: value[run].detach() for key, value in self.parameters[name].items()}
+        return lambda *inputs: functional_call(self.modules[name], own, inputs)
 
     def state(self) -> dict[str, Tensor]:
         """Every tensor of the agent by a flat name: online.*, target.*, adam.* and the number of updates."""
@@ -233,8 +237,8 @@ class Agent:
         self.updates = int(tensors["updates"])
 
     def __getstate__(self):
-        """What a worker process needs to act: not the optimiser."""
-        return {key: value for key, value in vars(self).items() if key != "optimiser"}
+        """What a worker process needs to act: not what only training needs."""
+        return {key: value for key, value in vars(self).items() if key not in ("optimiser", "borrowers")}
 
     def _build_seeded(self, seed: int) -> dict[str, nn.Module]:
         with torch.random.fork_rng(devices=[]):
@@ -245,10 +249,10 @@ class Agent:
         self, parameters, target_parameters, batch: Batch, limit: Tensor, *noise: Tensor
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """One run's losses, summed, and its scalars, as a function of its parameters."""
-        online = {name: _bind(self.modules[name], p) for name, p in parameters.items()}
-        target = {f"target_{name}": _bind(self.modules[name], p) for name, p in target_parameters.items()}
-        frozen = {f"frozen_{n}": _bind(self.modules[n], _detached(parameters[n])) for n in self.frozen}
-        net = SimpleNamespace(**online, **target, **frozen)
+        target = {f"target_{name}": p for name, p in target_parameters.items()}
+        frozen = {f"frozen_{name}": _detached(parameters[name]) for name in self.frozen}
+        lent = parameters | target | frozen
+        net = SimpleNamespace(**{name: self.borrowers[name].lend(p) for name, p in lent.items()})
         losses, scalars = self.losses(net, batch, limit, *noise)
         scalars = {f"{name}_loss": loss for name, loss in losses.items()} | scalars
         return sum(losses.values()), {name: value.detach() for name, value in scalars.items()}
@@ -269,11 +273,6 @@ def cost_guess(task: Task, gammas: Sequence[float]) -> tuple[float, ...]:
     """A first guess of the m heads of Q_c and V_c: the cost rate of the middle threshold, for ever."""
     rate = task.thresholds[1] / task.horizon
     return tuple(rate / (1 - gamma) for gamma in gammas)
-
-
-def _bind(module: nn.Module, parameters: dict[str, Tensor]) -> Callable[..., Tensor]:
-    """The module as a function of its inputs alone, with these parameters for its own."""
-    return lambda *inputs: functional_call(module, parameters, inputs)
 
 
 def _detached(parameters: dict[str, Tensor]) -> dict[str, Tensor]:
