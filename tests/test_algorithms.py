@@ -141,6 +141,12 @@ class Slow:
             if self.name != "IQL":
                 critics = [k[0] for k in self.call("target", "cost_critics", s, a)]
                 cost, q_cost = max((self.cost(heads), heads) for heads in critics)
+                stops = x.terminals or (config.time_limits == "mask" and x.timeouts)
+                after = self.call("online", "cost_value", s_next)[0]
+                gammas = TASK.gammas if len(after) > 1 else [config.gamma]
+                backup = [x.costs + (0 if stops else g * c) for g, c in zip(gammas, after, strict=True)]
+                if config.recorded_step:
+                    cost = max(cost, self.cost(backup))
                 if config.unsafe_price is not None:
                     price = config.unsafe_price * self.state["reward_scale"].item() / TASK.cost_range
                     state_cost = self.cost(self.call("online", "cost_value", s)[0])
@@ -163,12 +169,8 @@ class Slow:
                 kappa = config.kappa_1 if config.cost_kappa is None else config.cost_kappa
                 errors = [(p - q) ** 2 for p, q in zip(q_cost, v_cost, strict=True)]
                 add("cost_value_loss", weight(kappa) * sum(errors) / len(errors))
-                next_cost = self.call("online", "cost_value", s_next)[0]
-                stops = x.terminals or (config.time_limits == "mask" and x.timeouts)
-                gammas = TASK.gammas if len(next_cost) > 1 else [config.gamma]
                 for heads in self.call("online", "cost_critics", s, a):
-                    for g, now, after in zip(gammas, heads[0], next_cost, strict=True):
-                        y = x.costs + (0 if stops else g * after)
+                    for now, y in zip(heads[0], backup, strict=True):
                         add("cost_critic_loss", (y - now) ** 2 / len(gammas))
 
             mean, log_std = self.call("online", "policy", s)
@@ -191,6 +193,8 @@ OPTIONS = [
     {"reward_time_limits": "mask"},
     {"cost_kappa": 0.95},
     {"unsafe_price": 0.5},
+    {"recorded_step": True},
+    {"recorded_step": True, "unsafe_price": 0.5, "time_limits": "mask"},
     {"cost_critics": 1},
     {"cost_critics": 3},
     {"kappa_1": 0.5, "kappa_2": 0.6, "gamma": 0.7},

@@ -51,6 +51,8 @@ class Recipe:
     """PPO's learning rate at the first and at the last step."""
     batch_steps: int = 4096
     """Steps between two PPO updates, over 16 environments."""
+    width: int = 64
+    """Of PPO's two hidden layers."""
 
 
 _RUN = {"prices": (0.2, 1.5), "allowance_share": 1.0, "allowances": (-0.2, 1.0), "ramp": None}
@@ -60,6 +62,8 @@ RECIPES = {
     "CarRun": Recipe(episodes=651, steps=800_000, **_RUN),
     "BallCircle": Recipe(episodes=886, steps=2_000_000),
     "CarCircle": Recipe(episodes=1_100, steps=1_500_000),
+    "DroneRun": Recipe(episodes=1_990, steps=2_000_000, width=128, **_RUN),
+    "DroneCircle": Recipe(episodes=1_923, steps=3_000_000, width=128),
 }
 
 
@@ -224,7 +228,7 @@ def _make_ppo(task: Task, recipe: Recipe, seed: int, episodes: list[dict], clock
     def learning_rate(_):  # stable-baselines3's own progress starts anew with every slice
         return first + (last - first) * clock["progress"]
 
-    policy = {"net_arch": [64, 64], "log_std_init": -0.5}
+    policy = {"net_arch": [recipe.width] * 2, "log_std_init": -0.5}
     return PPO(
         "MlpPolicy",
         envs,

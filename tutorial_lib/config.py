@@ -82,6 +82,11 @@ class Config:
     """None: an unsafe action is worth zero, as in the paper; where all actions are unsafe the policy is then
     left to chance. A number: it keeps its Q_r and pays for its excess over the limit, so many times the
     dataset's mean Q_r per cost range, as with a Lagrange multiplier that acts beyond the limit only."""
+    recorded_step: bool = False
+    """An action costs no less than the step that the data recorded of it, c + gamma V_c(s'), reconstructed.
+    The critics are smooth; the step is exact about where cost sets in (a speed, a wall), and of two noisy
+    estimates the higher one leaves a margin. Without it agents that move along such a line run on either side
+    of it by chance."""
     shift_rewards: bool = False
     """Train on rewards minus their dataset minimum. The zero penalty punishes only where Q_r > 0."""
 
@@ -112,8 +117,9 @@ PROFILES["small"] = dataclasses.replace(
     crm_noise_rate=0.01,
     # ... and where all actions look unsafe, they must be ranked.
     unsafe_price=6.0,
-    # A spent budget needs a mode of its own.
+    # A spent budget needs a mode of its own, and a margin where cost sets in at a line.
     zero_threshold=True,
+    recorded_step=True,
 )
 
 

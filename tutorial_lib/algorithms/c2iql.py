@@ -88,6 +88,13 @@ class C2IQL(Agent):
         cost, worst = self.episode_cost(q_cost).max(0)  # (B,)
         q_cost = q_cost.take_along_dim(worst[None, :, None], 0).squeeze(0)  # (B, m)
 
+        # Line 18's target, here already: what the recorded step expects. (Eq. 16 prints V_c(s); s' is meant.)
+        cost_target = L.td_target(
+            batch.costs[:, None], self.gammas, net.cost_value(s_next), cost_mask[:, None]
+        )
+        if config.recorded_step:
+            cost = torch.maximum(cost, self.episode_cost(cost_target.detach()))
+
         # Lines 9-10: constraint penalisation.
         q_reward = net.target_critics(s, a).amin(0)
         v_cost = net.cost_value(s)  # (B, m)
@@ -105,10 +112,7 @@ class C2IQL(Agent):
         target = L.td_target(batch.rewards, config.gamma, net.value(s_next), self.reward_mask(batch))
         critic_loss = L.td_loss(target, net.critics(s, a))
 
-        # Lines 17-18: cost Q-value function, every gamma_i at once. (Eq. 16 prints V_c(s); s' is meant.)
-        cost_target = L.td_target(
-            batch.costs[:, None], self.gammas, net.cost_value(s_next), cost_mask[:, None]
-        )
+        # Lines 17-18: cost Q-value function, every gamma_i at once.
         cost_critic_loss = L.td_loss(cost_target, net.cost_critics(s, a))
 
         # Lines 19-20: policy extraction.

@@ -1,5 +1,7 @@
 """Constrained implicit Q-learning (Section 3.1): IQL with a penalty, and costs under the same policy."""
 
+import torch
+
 from tutorial_lib import losses as L
 from tutorial_lib.algorithms.base import Agent, cost_guess, reward_guess
 from tutorial_lib.discounting import average_threshold
@@ -35,6 +37,11 @@ class CIQL(Agent):
 
         q_cost = net.target_cost_critics(s, a).amax(0)  # (B, 1)
         cost = self.episode_cost(q_cost)
+        cost_target = L.td_target(
+            batch.costs[:, None], config.gamma, net.cost_value(s_next), mask[:, None]
+        )  # eq. 16
+        if config.recorded_step:
+            cost = torch.maximum(cost, self.episode_cost(cost_target.detach()))
         q_reward = net.target_critics(s, a).amin(0)
         v_cost = net.cost_value(s)  # (B, 1)
         q = self.penalised_q(q_reward, cost, v_cost, limit)  # eq. 11
@@ -47,9 +54,6 @@ class CIQL(Agent):
         target = L.td_target(batch.rewards, config.gamma, net.value(s_next), self.reward_mask(batch))
         critic_loss = L.td_loss(target, net.critics(s, a))
 
-        cost_target = L.td_target(
-            batch.costs[:, None], config.gamma, net.cost_value(s_next), mask[:, None]
-        )  # eq. 16
         cost_critic_loss = L.td_loss(cost_target, net.cost_critics(s, a))
 
         weight = L.expectile_weight(q - v, config.kappa_2)
