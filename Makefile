@@ -53,8 +53,8 @@ student: $(READY)
 	@echo "The notebooks without solutions lie in $(CURDIR)/build/student."
 
 test: $(READY)
-	$(BIN) -m pytest tests
-	$(if $(NOTEBOOKS),$(BIN) -m pytest --nbval-lax --nbval-current-env --nbval-cell-timeout 600 \
+	$(BIN) -m pytest --durations=10 tests
+	$(if $(NOTEBOOKS),$(BIN) -m pytest --durations=10 --nbval-lax --nbval-current-env --nbval-cell-timeout 600 \
 		--nbval-sanitize-with tests/sanitize.cfg notebooks)
 
 lab: $(READY)

@@ -260,26 +260,17 @@ def test_a_folder_that_cannot_be_written_is_one_line_of_error(c2iql, data, tmp_p
     assert status == 1 and "Traceback" not in err and err.splitlines()[-1].startswith("c2iql: ")
 
 
-def test_every_part_of_an_update_takes_time():
-    table = bench.training(TASKS["BallRun"], [("small", 1), ("small", 2)], rounds=1, seconds=0.02)
-    shares = table[list(bench.PARTS)].to_numpy()
-    assert (shares > 0).all() and shares.sum(1) == pytest.approx(1)
-    assert (table["hours"] * table["updates_per_second"] * 3600).tolist() == pytest.approx(
-        [cli.get_profile("small").steps] * 2
-    )
-
-
 def test_bench_prints_both_tables(c2iql, monkeypatch):
     tiny = cli.with_options(cli.get_profile("small"), tuple(TINY))
     monkeypatch.setattr(bench, "PROFILES", {"small": tiny})
-    monkeypatch.setattr(bench, "get_profile", lambda name: tiny)
+    monkeypatch.setattr(bench.updates, "get_profile", lambda name: tiny)
     status, out, err = c2iql("bench", "--task", "BallRun", "--rounds", 1, "--workers", 1)
     assert status == 0, err
     lines = [line.split() for line in out.splitlines()]
     rows = [line for line in lines if line[:1] == ["small"]]
     assert [row[1] for row in rows] == ["1", "3"]
     for row in rows:
-        shares = [int(cell.rstrip("%")) for cell in row[4:]]
+        shares = [int(cell.rstrip("%")) for cell in row[5:]]
         assert len(shares) == len(bench.PARTS) and 98 <= sum(shares) <= 102
         assert float(row[2]) > 1
     assert ["bare", "simulator", "1"] in [line[:3] for line in lines]

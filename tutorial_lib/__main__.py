@@ -198,26 +198,41 @@ def study(
 
 
 def bench(
-    task: str = "BallCircle", workers: int | None = None, rounds: int = 3, device: Device = "cpu"
+    task: str = "BallCircle",
+    workers: int | None = None,
+    rounds: int = 3,
+    device: Device = "cpu",
+    full: bool = False,
+    peers: bool = False,
 ) -> None:
     """Measure this machine, in about a minute: how fast agents train, and how fast simulators step.
 
-    The table of training has updates per second, the hours that all the profile's updates take, and the share
-    of the time of each part of an update. The table of simulation compares with the bare simulator's speed
-    times the processes. What else runs on the machine counts, too.
+    The table of training has updates per second, the hours that all the profile's updates take, the rate of
+    arithmetic against that of one large matrix product, and the share of the time of each part of an update.
+    The table of simulation compares with the bare simulator's speed times the processes. What else runs on
+    the machine counts, too.
 
     Args:
         task: which task's simulator and sizes.
         workers: processes for rollouts; default one for each core.
         rounds: how often each speed is measured; the median is shown.
         device: of the training: cpu or cuda.
+        full: measure every algorithm, other libraries' too, at two tasks' sizes, in some minutes, and write
+            data/results/bench/; then `c2iql report` makes tables and a figure of it.
+        peers: first install the other libraries for --full with pip, into runs/bench/peers.
     """
     from tutorial_lib import bench as benchmarks
 
     record, device = get_task(task), check_device(device)
+    if peers:
+        benchmarks.install()
+    if full:
+        written = benchmarks.full(workers=workers, rounds=rounds, device=device)
+        print("\n".join(f"wrote {path}" for path in written))
+        return
     training_speeds, simulation_speeds = benchmarks.bench(record, workers, rounds, device=device)
     print(f"C2IQL on {record.name}, {device}, {torch.get_num_threads()} thread(s): shares of an update")
-    shares = dict.fromkeys(benchmarks.PARTS, "{:.0%}".format)
+    shares = dict.fromkeys(("of_product", *benchmarks.PARTS), "{:.0%}".format)
     others = {"updates_per_second": "{:.1f}".format, "hours": "{:.2f}".format}
     print(training_speeds.to_string(index=False, formatters=shares | others))
     print(f"\nSimulator of {record.name}: steps per second, and their share of bare simulator x processes")

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pandas as pd
 
+from tutorial_lib.bench import tables
 from tutorial_lib.datasets import SHIPPED_DATA, load_dataset, shipped_tasks
 from tutorial_lib.evaluation import summarise, with_scores
 from tutorial_lib.logs import best_left
@@ -170,6 +171,37 @@ def write_study(name: str) -> Path | None:
     return path
 
 
+# --- Speed ---
+
+
+def speed_front() -> str:
+    """What was aimed at for the speed of training, and what was found."""
+    updates = tables.load("updates")
+    return tables.NOT_RUN if updates is None else markdown(tables.marks(updates))
+
+
+def speed_text() -> str:
+    """Everything that `c2iql bench --full` measured, and where."""
+    updates, simulation, machine = (tables.load(name) for name in tables.FILES)
+    if updates is None:
+        return tables.NOT_RUN
+    made = (tables.yardsticks, tables.by_algorithm, tables.by_part, tables.growth)
+    parts = [tables.circumstances(machine), "![speed](results/bench/speed.png)"]
+    parts += [markdown(table(updates)) for table in made]
+    return "\n\n".join([*parts, markdown(tables.rollouts(simulation))])
+
+
+def write_speed() -> Path | None:
+    """Draw the figure of speed beside its files; None where nothing was measured."""
+    from tutorial_lib.plotting import speed
+
+    updates, path = tables.load("updates"), tables.FOLDER / "speed.png"
+    if updates is None:
+        return None
+    path.write_bytes(speed(updates).small_png())
+    return path
+
+
 # --- Pages ---
 
 
@@ -192,11 +224,12 @@ def pages() -> dict[Path, str]:
     """Every page that holds made tables, as it should read now."""
     data, readme = SHIPPED_DATA / "README.md", ROOT / "README.md"
     text = data.read_text()
-    tables = {"datasheet": datasheet, "frontier": frontier, "results": results_table}
-    for name, table in (tables | {"studies": studies_text}).items():
+    made = {"datasheet": datasheet, "frontier": frontier, "results": results_table}
+    for name, table in (made | {"studies": studies_text, "speed": speed_text}).items():
         text = between_marks(text, name, table())
     front = readme.read_text()
-    for name, table in (("results", results_table), ("baselines", baselines_table)):
+    front_tables = (("results", results_table), ("baselines", baselines_table), ("speed", speed_front))
+    for name, table in front_tables:
         front = between_marks(front, name, table())
     return {data: text, readme: front}
 
@@ -205,7 +238,7 @@ def write() -> list[Path]:
     """Bring the pages, the pictures of the datasets and the studies' figures up to date. Returns them all."""
     from tutorial_lib.plotting import cost_return_plane
 
-    figures = [path for path in map(write_study, STUDIES) if path]
+    figures = [path for path in (*map(write_study, STUDIES), write_speed()) if path]
     written = pages()
     for path, text in written.items():
         path.write_text(text)

@@ -12,5 +12,6 @@ from tutorial_lib.plotting.ood import *
 from tutorial_lib.plotting.penalty import *
 from tutorial_lib.plotting.reconstruction import *
 from tutorial_lib.plotting.results import *
+from tutorial_lib.plotting.speed import *
 from tutorial_lib.plotting.studies import *
 from tutorial_lib.plotting.style import *

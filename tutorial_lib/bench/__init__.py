@@ -1,0 +1,120 @@
+"""What this machine can do: `c2iql bench` measures training and simulation in about a minute.
+
+`c2iql bench --full` measures every algorithm, a plain version of C2IQL and other libraries' algorithms, and
+how cost grows with seeds, batch and data, in some minutes. Tables and figure of speed are made of its files.
+"""
+
+import os
+import platform
+from collections.abc import Callable
+from datetime import date
+from importlib.metadata import version
+from pathlib import Path
+
+import joblib
+import pandas as pd
+import torch
+from tqdm.auto import tqdm
+
+from tutorial_lib.bench.cases import TASKS, groups, measure, side_by_side
+from tutorial_lib.bench.peers import install
+from tutorial_lib.bench.simulation import simulation
+from tutorial_lib.bench.tables import FILES, FOLDER, with_shares
+from tutorial_lib.bench.updates import PARTS, PRODUCT, Case
+from tutorial_lib.config import PROFILES
+from tutorial_lib.tasks import Task, get_task
+
+__all__ = ["PARTS", "bench", "full", "install", "machine", "training"]
+BUSY = 0.5
+"""Load per machine, before the start, from which two processes are not compared with one."""
+
+
+def bench(
+    task: Task, workers: int | None = None, rounds: int = 3, seconds: float = 0.6, device="cpu"
+) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Both tables, `training` and `simulation`. A measurement of training lasts `seconds` or one update."""
+    workers = workers or joblib.cpu_count()  # the cores that this process may use
+    cases = [(profile, runs) for profile in PROFILES for runs in (1, 3)]
+    with tqdm(total=(rounds + 1) * (len(cases) + 6), desc="measuring", leave=False) as bar:
+        return (
+            training(task, cases, rounds, seconds, device, bar.update),
+            simulation(task, workers, rounds, bar.update),
+        )
+
+
+def training(
+    task: Task,
+    cases: list[tuple[str, int]],
+    rounds: int = 3,
+    seconds: float = 0.6,
+    device="cpu",
+    done: Callable[[], object] = lambda: None,
+) -> pd.DataFrame:
+    """One row per case (profile, runs trained together): updates per second, each part's share of the time.
+
+    Real updates of C2IQL on random transitions: how long they take does not depend on what they hold.
+    `hours` is what the profile's number of updates would take, without its reconstruction model; `of_product`
+    compares the arithmetic per second with that of one large product of matrices.
+    """
+    chosen = [Case("C2IQL", task.name, profile, runs) for profile, runs in cases]
+    found = with_shares(measure([Case(PRODUCT, task.name), *chosen], rounds, seconds, device, done))
+    rows = []
+    for (profile, runs), part in found[found["what"] == "C2IQL"].groupby(["profile", "runs"], sort=False):
+        speed = 1 / part["seconds"].median()
+        row = {"profile": profile, "runs": runs, "updates_per_second": speed}
+        row |= {"hours": PROFILES[profile].steps / speed / 3600, "of_product": part["share"].median()}
+        shares = part[list(PARTS)].div(part["seconds"], axis=0).median()
+        rows.append(row | dict(shares / shares.sum()))
+    return pd.DataFrame(rows).sort_values(["profile", "runs"], ignore_index=True)
+
+
+def full(
+    folder: Path = FOLDER,
+    workers: int | None = None,
+    rounds: int = 3,
+    seconds: float = 0.3,
+    device="cpu",
+    missing: Callable[[str], object] = tqdm.write,
+) -> list[Path]:
+    """Measure everything and write `folder`'s files: updates, simulation, machine. Returns their paths."""
+    workers, load = workers or joblib.cpu_count(), os.getloadavg()[0]
+    everything, together = groups(), Case("C2IQL", TASKS[0])
+    total = (rounds + 1) * sum(map(len, everything.values())) + 10 * len(TASKS)
+    with tqdm(total=total, desc="measuring", leave=False) as bar:
+        parts = [
+            measure(cases, rounds, seconds, device, bar.update, missing).assign(group=name)
+            for name, cases in everything.items()
+        ]
+        if load > BUSY:
+            missing(f"{workers} processes at once: not measured, the machine is busy (load {load:.1f})")
+        else:
+            parts.append(side_by_side(together, workers, rounds).assign(group="processes"))
+        rollouts = [simulation(get_task(task), workers, 1, bar.update).assign(task=task) for task in TASKS]
+    tables = {
+        "updates": pd.concat(parts, ignore_index=True),
+        "simulation": pd.concat(rollouts, ignore_index=True),
+        "machine": machine(device, load),
+    }
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, table in tables.items():
+        table.to_csv(folder / FILES[name], index=False, float_format="%.6g")
+    return [folder / FILES[name] for name in tables]
+
+
+def machine(device, load: float) -> pd.DataFrame:
+    """What the numbers hold for: one row per fact."""
+    lines = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else []
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    facts = {
+        "date": date.today().isoformat(),
+        "processor": names[0] if names else platform.processor() or platform.machine(),
+        "cores": joblib.cpu_count(),
+        "instructions": torch.backends.cpu.get_cpu_capability(),
+        "device": torch.cuda.get_device_name() if str(device) == "cuda" else "cpu",
+        "threads": torch.get_num_threads(),
+        "load before the start": f"{load:.1f}",
+        "system": platform.system(),
+        "Python": platform.python_version(),
+        **{name: version(name) for name in ("torch", "numpy", "pybullet")},
+    }
+    return pd.DataFrame({"what": facts.keys(), "value": facts.values()})

@@ -1,0 +1,109 @@
+"""What is measured, and in which turns.
+
+Machines are noisy, so what is compared is measured in turns, several times: a ratio is the median of the
+ratios of measurements that stand side by side. Numbers depend on what else is running.
+"""
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+
+import joblib
+import pandas as pd
+import torch
+
+from tutorial_lib.algorithms import ALGORITHMS
+from tutorial_lib.bench.peers import PEERS, Peer
+from tutorial_lib.bench.updates import EAGER, PRODUCT, Case, OurUpdates, Steps
+from tutorial_lib.config import PROFILES
+
+TASKS = ("AntCircle", "CarCircle")
+SMALL_CRM = "3 x 128"
+"""As exact as the paper's model on the noise that the critics make: `results/reconstruction.csv`."""
+
+
+def groups() -> dict[str, list[Case]]:
+    """All that `c2iql bench --full` measures on one process; within a group everything is comparable."""
+    ant, car = TASKS
+    product = [Case(PRODUCT, ant), Case(PRODUCT, ant, products="default")]
+
+    def yardsticks(task):
+        ours = [Case("C2IQL", task), Case("C2IQL", task, products="default")]
+        ours += [Case("C2IQL", task, crm=SMALL_CRM), Case("C2IQL", task, products="bfloat16")]
+        plain = [Case(EAGER, task, products="default"), Case(EAGER, task)]
+        others = [Case("IQL", task), Case("CPQ", task)]
+        others += [Case(name, task, products="default") for name in PEERS]
+        return product + ours + plain + others
+
+    return {
+        f"yardsticks {ant}": yardsticks(ant),
+        f"yardsticks {car}": yardsticks(car),
+        "algorithms": [
+            Case(name, task, profile) for profile in PROFILES for task in TASKS for name in ALGORITHMS
+        ],
+        "seeds": [Case("C2IQL", ant, profile, runs) for profile in PROFILES for runs in (1, 2, 5, 10)],
+        "batch": [Case("C2IQL", ant, batch=batch) for batch in (128, 256, 512, 1024)],
+        "rows": [Case("C2IQL", ant, rows=rows) for rows in (10_000, 100_000, 1_000_000)],
+    }
+
+
+def stopwatch(case: Case, device="cpu"):
+    """What times this case. ValueError for a peer that is not installed."""
+    if case.what in PEERS:
+        return Peer(case, device)
+    return Steps(case, device) if case.what in (EAGER, PRODUCT) else OurUpdates(case, device)
+
+
+def measure(
+    cases: Sequence[Case],
+    rounds: int = 3,
+    seconds: float = 0.6,
+    device="cpu",
+    done: Callable[[], object] = lambda: None,
+    missing: Callable[[str], object] = print,
+) -> pd.DataFrame:
+    """One row per case and round: the case, the round, FLOP and seconds per update, and of each part.
+
+    A measurement lasts `seconds` or one update. What cannot be measured is left out, and `missing` told why.
+    """
+    watches = {}
+    for case in cases:
+        try:
+            watches[case] = stopwatch(case, device)
+        except ValueError as reason:
+            missing(str(reason))
+    rows = []
+    for turn in range(rounds + 1):  # the first turn is a warm-up
+        order = list(watches.items())
+        for case, watch in order if turn % 2 else reversed(order):
+            found = watch.measure(seconds if turn else 0)
+            if turn:
+                rows.append(asdict(case) | {"config_batch": case.config.batch_size} | {"round": turn})
+                rows[-1] |= {"flop": watch.flop} | found
+            done()
+    return pd.DataFrame(rows).drop(columns="batch").rename(columns={"config_batch": "batch"})
+
+
+def side_by_side(case: Case, most: int, rounds: int = 3, seconds: float = 2.0) -> pd.DataFrame:
+    """One row per number of processes, up to `most`, and round: seconds per update of them all, by the clock.
+
+    One thread each. Where other work keeps the cores busy this says nothing of the code.
+    """
+    rows = []
+    for turn in range(rounds + 1):
+        for count in (1, most):
+            jobs = [joblib.delayed(_rate)(case, seconds if turn else 0)] * count
+            rates = joblib.Parallel(n_jobs=count)(jobs)
+            if turn:
+                row = asdict(case) | {"batch": case.config.batch_size, "processes": count, "round": turn}
+                rows.append(row | {"seconds": 1 / sum(rates)})
+    return pd.DataFrame(rows)
+
+
+def _rate(case: Case, seconds: float) -> float:
+    """Updates per second by the clock on the wall."""
+    torch.set_num_threads(1)
+    watch = OurUpdates(case)
+    watch.now = time.perf_counter
+    watch.measure(0)
+    return 1 / watch.measure(seconds)["seconds"]

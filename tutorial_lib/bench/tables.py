@@ -1,0 +1,165 @@
+"""Tables of speed from the files that `c2iql bench --full` wrote."""
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from tutorial_lib.bench.cases import SMALL_CRM, TASKS
+from tutorial_lib.bench.peers import PEERS
+from tutorial_lib.bench.updates import EAGER, PARTS, PRODUCT
+from tutorial_lib.datasets import SHIPPED_DATA
+from tutorial_lib.tasks import get_task
+
+FOLDER = SHIPPED_DATA / "results" / "bench"
+FILES = {name: f"{name}.csv" for name in ("updates", "simulation", "machine")}
+NOT_RUN = "*Not measured: `c2iql bench --full` does it.*"
+OURS, SMALL = "C2IQL", f"C2IQL, its reconstruction model {SMALL_CRM}"
+NAMES = {  # what stands in the table: (what, products, crm)
+    "C2IQL": (OURS, "float32", "5 x 512"),
+    SMALL: (OURS, "float32", SMALL_CRM),
+    "C2IQL, bfloat16 allowed": (OURS, "bfloat16", "5 x 512"),
+    "C2IQL, PyTorch's default products": (OURS, "default", "5 x 512"),
+    "plain eager C2IQL, our products": (EAGER, "float32", "5 x 512"),
+    EAGER: (EAGER, "default", "5 x 512"),
+    "our IQL": ("IQL", "float32", "5 x 512"),
+    "our CPQ": ("CPQ", "float32", "5 x 512"),
+    **{name: (name, "default", "5 x 512") for name in PEERS},
+}
+
+
+def load(name: str, folder: Path | None = None) -> pd.DataFrame | None:
+    """One of the files, or None where nothing was measured."""
+    path = (folder or FOLDER) / FILES[name]
+    return pd.read_csv(path) if path.exists() else None
+
+
+def with_shares(updates: pd.DataFrame) -> pd.DataFrame:
+    """With `share`: arithmetic per second against that of one large float32 product in the same round."""
+    product = updates[(updates["what"] == PRODUCT) & (updates["products"] == "float32")]
+    rate = (product["flop"] / product["seconds"]).set_axis(product["round"])
+    return updates.assign(share=updates["flop"] / updates["seconds"] / updates["round"].map(rate))
+
+
+def seconds(updates: pd.DataFrame, **case) -> pd.Series:
+    """Seconds per update of one case, by round; empty where it was not measured."""
+    return _select(updates, case).set_index("round")["seconds"]
+
+
+def case_of(name: str) -> dict:
+    """The columns that make one of `NAMES`."""
+    return dict(zip(("what", "products", "crm"), NAMES[name], strict=True))
+
+
+def ratio(updates: pd.DataFrame, slow: dict, fast: dict) -> float:
+    """How many times as fast: the median of the rounds' ratios, NaN where one was not measured."""
+    return float((seconds(updates, **slow) / seconds(updates, **fast)).median())
+
+
+def yardsticks(updates: pd.DataFrame) -> pd.DataFrame:
+    """One row per contestant, profile `paper`: updates per second, share of the product's rate, x plain."""
+    rows = []
+    parts = {task: with_shares(updates[updates["group"] == f"yardsticks {task}"]) for task in TASKS}
+    for name in NAMES:
+        case, row = case_of(name), {"profile `paper`": name}
+        for task, part in parts.items():
+            own = _select(part, case)
+            if not len(own):
+                row |= {f"{task}: updates/s": "not measured"}
+                continue
+            row.setdefault("GFLOP", f"{own['flop'].iloc[0] / 1e9:.1f}")
+            row[f"{task}: updates/s"] = f"{1 / own['seconds'].median():.1f}"
+            row[f"{task}: share"] = f"{own['share'].median():.0%}"
+            row[f"{task}: x plain"] = f"{ratio(part, case_of(EAGER), case):.2f}"
+        rows.append(row)
+    columns = ["profile `paper`", "GFLOP"]
+    columns += [f"{task}: {x}" for task in TASKS for x in ("updates/s", "share", "x plain")]
+    return pd.DataFrame(rows).reindex(columns=columns)
+
+
+def marks(updates: pd.DataFrame) -> pd.DataFrame:
+    """What was aimed at, and what was found: ratios of one run, the median over rounds, for both tasks."""
+    ours, small, plain = case_of(OURS), case_of(SMALL), case_of(EAGER)
+    aims = {
+        "arithmetic, against that of one large product": (0.8, None),
+        f"x plain eager, with a reconstruction model of {SMALL_CRM}": (2.2, (plain, small)),
+        "x plain eager, with the same model": (None, (plain, ours)),
+        f"x OSRL's CPQ, with a model of {SMALL_CRM}": (10, (case_of("OSRL's CPQ"), small)),
+    }
+    rows = []
+    for aim, (wanted, pair) in aims.items():
+        row = {"mark": aim, "aim": "" if wanted is None else f"{wanted:g}"}
+        for task in TASKS:
+            part = with_shares(updates[updates["group"] == f"yardsticks {task}"])
+            found = ratio(part, *pair) if pair else _select(part, ours)["share"].median()
+            row[task] = _number(found)
+        rows.append(row)
+    both = updates[updates["group"] == "processes"]
+    most = both["processes"].max()
+    alone, together = ({"processes": count} for count in (1, most))
+    rows.append({"mark": "two processes on two cores, x one", "aim": "1.9"})
+    rows[-1][TASKS[0]] = _number(ratio(both, alone, together) if most == 2 else np.nan)
+    seeds = updates[updates["group"] == "seeds"]
+    for profile in ("paper", "small"):
+        found = ratio(seeds, {"profile": profile, "runs": 5}, {"profile": profile, "runs": 1})
+        row = {"mark": f"cost of five seeds together, x one, profile `{profile}`", "aim": "at most 4"}
+        rows.append(row | {TASKS[0]: _number(found)})
+    return pd.DataFrame(rows)
+
+
+def by_algorithm(updates: pd.DataFrame) -> pd.DataFrame:
+    """Updates per second of every algorithm: one row each, one column per profile and task."""
+    part = updates[updates["group"] == "algorithms"]
+    speed = 1 / part.groupby(["what", "profile", "task"], sort=False)["seconds"].median()
+    table = speed.unstack(["profile", "task"])
+    table.columns = [f"`{profile}`, {task}" for profile, task in table.columns]
+    return table.map("{:.1f}".format).rename_axis("updates/s").reset_index()
+
+
+def by_part(updates: pd.DataFrame) -> pd.DataFrame:
+    """Where an update's time goes: the parts' shares, by profile and number of seeds."""
+    part = updates[updates["group"] == "seeds"]
+    shares = (
+        part[list(PARTS)].div(part["seconds"], axis=0).groupby([part["profile"], part["runs"]], sort=False)
+    )
+    table = shares.median().map("{:.0%}".format).reset_index()
+    return table.rename(columns={"runs": "seeds"})
+
+
+def growth(updates: pd.DataFrame) -> pd.DataFrame:
+    """Milliseconds per update as seeds, batch or dataset grow, and the multiple of the first."""
+    rows = []
+    for group, column in (("seeds", "runs"), ("batch", "batch"), ("rows", "rows")):
+        part = updates[updates["group"] == group]
+        for profile, own in part.groupby("profile", sort=False):
+            sizes = own[column].unique()
+            words = [f"{size:,}: {seconds(own, **{column: size}).median() * 1e3:.3g}" for size in sizes]
+            last = ratio(own, {column: sizes[-1]}, {column: sizes[0]})
+            times = f"{sizes[-1] / sizes[0]:g} x as many cost {last:.2f} x"
+            row = {"what grows": group, "profile": profile, "ms per update": "; ".join(words)}
+            rows.append(row | {"growth": times})
+    return pd.DataFrame(rows)
+
+
+def rollouts(simulation: pd.DataFrame) -> pd.DataFrame:
+    """Seconds per evaluation episode, and the speed against the bare simulator's."""
+    table = simulation.assign(horizon=simulation["task"].map(lambda name: get_task(name).horizon))
+    table["s per episode"] = (table["horizon"] / table["steps_per_second"]).map("{:.3f}".format)
+    table["of the bare simulator"] = table["of_bare"].map("{:.0%}".format)
+    table["steps/s"] = table["steps_per_second"].map("{:.0f}".format)
+    return table[["task", "what", "processes", "steps/s", "s per episode", "of the bare simulator"]]
+
+
+def circumstances(machine: pd.DataFrame) -> str:
+    """The machine in one sentence."""
+    return ", ".join(f"{what} {value}" for what, value in machine.to_numpy()) + "."
+
+
+def _select(updates: pd.DataFrame, case: dict) -> pd.DataFrame:
+    for column, value in case.items():
+        updates = updates[updates[column] == value]
+    return updates
+
+
+def _number(value: float) -> str:
+    return "not measured" if np.isnan(value) else f"{value:.2f}"
