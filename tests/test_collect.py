@@ -255,8 +255,8 @@ def test_ppo_is_saved_and_loaded_whole(tmp_path):
 
 def test_a_task_without_a_recipe_is_an_error_that_names_those_with_one():
     assert get_recipe(BALL).episodes == 940
-    with pytest.raises(ValueError, match="AntRun has no recipe yet.*BallRun, CarRun"):
-        get_recipe(TASKS["AntRun"])
+    with pytest.raises(ValueError, match="AntCircle has no recipe yet.*BallRun, CarRun"):
+        get_recipe(TASKS["AntCircle"])
 
 
 if __name__ == "__main__":

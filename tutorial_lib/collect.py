@@ -63,6 +63,7 @@ RECIPES = {
     "BallCircle": Recipe(episodes=886, steps=2_000_000),
     "CarCircle": Recipe(episodes=1_100, steps=1_500_000),
     "DroneRun": Recipe(episodes=1_990, steps=2_000_000, width=128, **_RUN),
+    "AntRun": Recipe(episodes=1_816, steps=3_000_000, width=128, **_RUN),
     "DroneCircle": Recipe(episodes=1_923, steps=3_000_000, width=128),
 }
 

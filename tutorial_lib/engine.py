@@ -10,6 +10,7 @@ import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
+import dask
 from distributed import Client, LocalCluster, as_completed, get_worker
 from distributed.scheduler import KilledWorker
 from tqdm.auto import tqdm
@@ -17,6 +18,9 @@ from tqdm.auto import tqdm
 from tutorial_lib.cells import Cell, results_path, run_cell
 
 TOPIC = "updates"
+ONE_THREAD = {f"{library}_NUM_THREADS": 1 for library in ("OMP", "MKL", "OPENBLAS")}
+"""The workers' environment: dask's, less its MALLOC_TRIM_THRESHOLD_. That one has the memory of every large
+tensor given back to the system and asked for again: half of an update's time."""
 
 
 @contextlib.contextmanager
@@ -32,6 +36,7 @@ def connect(scheduler: str | None = None, workers: int | None = None) -> Iterato
             # are many, and a cell needs little.
             options = {"threads_per_worker": 1, "memory_limit": None, "dashboard_address": None}
             options |= {"silence_logs": logging.CRITICAL}  # what matters is reported at the end
+            stack.enter_context(dask.config.set({"distributed.nanny.pre-spawn-environ": ONE_THREAD}))
             scheduler = stack.enter_context(LocalCluster(n_workers=workers, **options))
         yield stack.enter_context(Client(scheduler))
 
