@@ -1,5 +1,6 @@
 """The course's site: the executed notebooks, and pages on the library made from its docstrings."""
 
+import importlib
 import json
 import pkgutil
 import re
@@ -22,11 +23,13 @@ exclude_patterns = ["tutorial_lib"]
 nb_execution_mode = "off"  # the Makefile has executed them
 nb_output_stderr = "remove"
 nb_merge_streams = True
+nb_render_markdown_format = "myst"  # plain CommonMark, the default, knows no tables
 nb_code_prompt_show = "Show a solution"  # nothing else is hidden
 nb_code_prompt_hide = "Hide it"
 nb_ipywidgets_js = {}  # sliders need a running kernel, and their scripts the network
 myst_enable_extensions = ["dollarmath", "amsmath"]
 autodoc_member_order = "bysource"
+add_module_names = False  # the page's title says it
 
 html_theme = "furo"
 html_static_path = html_css_files = ["style.css"]
@@ -48,10 +51,17 @@ def write_reference_pages(app):
     for name in names:
         page = f"# {name}\n\n```{{eval-rst}}\n.. automodule:: {name}\n   :members:\n```\n"
         (folder / f"{name}.md").write_text(page)
+    rows = [f"| [{name}](reference/{name}.md) | {first_paragraph(name)} |" for name in names]
+    table = "\n".join(["| module | what it holds |", "|---|---|", *rows])
     entries = "\n".join(f"reference/{name}" for name in names)
     words = "From the docstrings, a page per module. (B,) and the like are shapes: one value per transition."
-    toctree = f"```{{toctree}}\n:maxdepth: 1\n\n{entries}\n```\n"
-    Path(app.srcdir, "reference.md").write_text(f"# Reference\n\n{words}\n\n{toctree}")
+    toctree = f"```{{toctree}}\n:hidden:\n\n{entries}\n```\n"
+    Path(app.srcdir, "reference.md").write_text(f"# Reference\n\n{words}\n\n{table}\n\n{toctree}")
+
+
+def first_paragraph(module: str) -> str:
+    text = importlib.import_module(module).__doc__.split("\n\n")[0]
+    return " ".join(text.split()).replace("|", r"\|")
 
 
 def finish_page(app, docname, source):

@@ -157,7 +157,7 @@ def to_go(steps, masked, continued, level: float):
     figure, ax = subplots(figsize=(11, 4.4))
     ax.plot(steps, continued, color=REWARD, label="a cut: the robot goes on at its rate")
     ax.plot(steps, masked, color=COST, label="the end: nothing follows")
-    ax.axhline(level, color=NEUTRAL, linewidth=1.5, label="its mean")
+    ax.axhline(level, color=NEUTRAL, linewidth=1.5, label="its mean over the steps")
     ax.set(xlabel="step", ylabel="discounted return to go", ylim=(0, None))
     legend_below(figure, ax)
     return figure

@@ -85,16 +85,14 @@ def expectile_of(values, kappa: float):
     mu = np.full(values.shape, 1 / values.size)
     level = expectile(mu, values, kappa)[0]
     figure, (left, right) = subplots(1, 2, figsize=(12, 4.6))
-    counts, edges = np.histogram(values, bins=40)
-    sides = (
-        (edges[:-1] < level, 1 - kappa, NEUTRAL, "worse"),
-        (edges[:-1] >= level, kappa, REWARD, "better"),
+    worse, better = values[values < level], values[values >= level]
+    left.hist(
+        [worse, better],
+        bins=np.histogram_bin_edges(values, 40),
+        stacked=True,
+        color=[NEUTRAL, REWARD],
+        label=[f"worse: weight {1 - kappa:.3g}", f"better: weight {kappa:.3g}"],
     )
-    for chosen, weight, colour, words in sides:
-        label = f"{words}: weight {weight:.3g}"
-        left.bar(
-            edges[:-1][chosen], counts[chosen], np.diff(edges)[0], align="edge", color=colour, label=label
-        )
     left.axvline(level, color=LIMIT, label="expectile")
     left.axvline(values.mean(), **DASHED | {"linewidth": 1.5}, label="mean")
     left.axvline(values.max(), color=COST, linewidth=1.5, label="best recorded")
