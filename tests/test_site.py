@@ -1,0 +1,60 @@
+"""The site: no warning, no link that leads nowhere, tables that code made are tables, and a way on."""
+
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from urllib.parse import unquote
+
+import nbformat
+import pytest
+
+ROOT = Path(__file__).parents[1]
+NOTEBOOKS = sorted(ROOT.glob("notebooks/*.ipynb"))
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    """Built as `make course` does, of the notebooks with their stored outputs."""
+    pages, built = (tmp_path_factory.mktemp(name) for name in ("pages", "site"))
+    shutil.copytree(ROOT / "notebooks", pages / "notebooks", ignore=shutil.ignore_patterns(".*"))
+    (pages / "tutorial_lib").symlink_to(ROOT / "tutorial_lib")
+    (pages / "data").mkdir()
+    for path in (ROOT / "data").iterdir():
+        if path.name != "README.md":
+            (pages / "data" / path.name).symlink_to(path)
+    for path in (ROOT / "data" / "README.md", *ROOT.glob("site/*.md")):
+        shutil.copy(path, pages / path.relative_to(ROOT / "site" if path.parent.name == "site" else ROOT))
+    command = [sys.executable, "-m", "sphinx", "-q", "-W", "--keep-going", "-c", ROOT / "site", pages, built]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
+    assert done.returncode == 0, done.stderr
+    return built
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_a_page_shows_tables_equations_and_the_way_on(site, path):
+    page = (site / "notebooks" / f"{path.stem}.html").read_text()
+    cells = nbformat.read(path, as_version=4).cells
+    outputs = [output.get("data", {}) for cell in cells for output in cell.get("outputs", [])]
+    texts = [data["text/markdown"] for data in outputs if "text/markdown" in data]
+    texts += [cell.source for cell in cells if cell.cell_type == "markdown"]
+    tables = sum(len(re.findall(r"^\|[-| :]+\|$", text, re.MULTILINE)) for text in texts)
+    assert page.count("<table") == tables + sum("<table" in data.get("text/html", "") for data in outputs)
+    assert 'class="math' in page
+    assert 'class="next-page"' in page and 'class="prev-page"' in page
+
+
+def test_every_link_leads_somewhere(site):
+    pages = {page: page.read_text() for page in site.rglob("*.html")}
+    assert len(pages) > 50
+    for page, text in pages.items():
+        for address in re.findall(r'(?:href|src)="([^"#]+)[^"]*"', text):
+            if not re.match(r"\w+:", address):
+                assert (page.parent / unquote(address.split("?")[0])).exists(), (page.name, address)
+
+
+def test_the_reference_has_a_line_on_every_module(site):
+    page = (site / "reference.html").read_text()
+    modules = [path for path in ROOT.glob("tutorial_lib/**/*.py") if path.name != "__main__.py"]
+    assert page.split("<table")[1].count("<tr") == len(modules)  # a head, and the package itself is no row
