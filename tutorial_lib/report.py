@@ -24,6 +24,7 @@ FIRST_LIGHT = RESULTS / "first-light.csv"
 DSRL_FRONTIER = {
     "BallRun": {0: 440, 20: 450, 50: 900, 80: 1300},
     "CarRun": {0: 570},
+    "DroneRun": {0: 410, 50: 500, 100: 660},
     "BallCircle": {0: 600, 30: 700, 60: 880},
     "CarCircle": {0: 430, 30: 480, 100: 530},
 }
