@@ -136,7 +136,7 @@ def sample_batch(data: Batch, batch_size: int, generators: Sequence[torch.Genera
     """
     count = len(data.rewards)
     rows = torch.stack([torch.randint(count, (batch_size,), generator=generator) for generator in generators])
-    flat = rows.flatten().to(data.rewards.device)
+    flat = rows.flatten().to(data.rewards.device, non_blocking=True)
     return Batch(*(values.index_select(0, flat).unflatten(0, rows.shape) for values in data))
 
 

@@ -1,6 +1,7 @@
 """Networks for one run; every one takes a leading batch axis B and returns values (B,) or heads (B, m)."""
 
 import copy
+import functools
 import math
 
 import torch
@@ -21,10 +22,16 @@ def _heads(scale: float | tuple[float, ...]) -> int:
     return len(scale) if isinstance(scale, tuple) else 1
 
 
+@functools.cache
+def _constant(values: tuple[float, ...], device: torch.device) -> Tensor:
+    """Made once: to copy numbers to a GPU at every call is to wait for it at every call."""
+    return torch.tensor(values, device=device)
+
+
 def _scaled(output: Tensor, scale: float | tuple[float, ...]) -> Tensor:
     """scale (1 + output): (..., m) with m scales, or (..., 1) with one, squeezed to (...,)."""
     if isinstance(scale, tuple):
-        return (1 + output) * torch.tensor(scale, device=output.device)
+        return (1 + output) * _constant(scale, output.device)
     return (1 + output.squeeze(-1)) * scale
 
 

@@ -183,13 +183,14 @@ def speed_front() -> str:
 
 def speed_text() -> str:
     """Everything that `c2iql bench --full` measured, and where."""
-    updates, simulation, machine = (tables.load(name) for name in tables.FILES)
+    updates, simulation, machine = (tables.load(name) for name in ("updates", "simulation", "machine"))
     if updates is None:
         return tables.NOT_RUN
     made = (tables.yardsticks, tables.by_algorithm, tables.by_part, tables.growth)
     parts = [tables.circumstances(machine), "![speed](results/bench/speed.png)"]
     parts += [markdown(table(updates)) for table in made]
-    return "\n\n".join([*parts, markdown(tables.rollouts(simulation))])
+    played = "*Rollouts: not measured.*" if simulation is None else markdown(tables.rollouts(simulation))
+    return "\n\n".join([*parts, played])
 
 
 def write_speed() -> Path | None:

@@ -158,9 +158,10 @@ class Agent:
         rates the difference is one step's worth, and one joint step is faster.)
         """
         size = batch.rewards.shape[1]
-        limits = torch.stack([self.draw_limits(g, size) for g in generators]).to(self.device)
+        limits = torch.stack([self.draw_limits(g, size) for g in generators])
+        limits = limits.to(self.device, non_blocking=True)  # a GPU is fed, not waited for
         noise = zip(*[self.draw_noise(g, size) for g in generators], strict=True)  # by kind, not by run
-        noise = [torch.stack(runs).to(self.device) for runs in noise]
+        noise = [torch.stack(runs).to(self.device, non_blocking=True) for runs in noise]
         if len(self.seeds) == 1:  # the same function without the lift, which is not free
             squeezed = _map(self.parameters, lambda p: p[0]), _map(self.target_parameters, lambda p: p[0])
             own = Batch(*(x[0] for x in batch)), limits[0], *(x[0] for x in noise)

@@ -76,29 +76,28 @@ def full(
     device="cpu",
     missing: Callable[[str], object] = tqdm.write,
 ) -> list[Path]:
-    """Measure everything and write `folder`'s files: updates, simulation, machine. Returns their paths."""
+    """Measure everything and write `folder`'s files: machine, updates, simulation. Returns their paths."""
     workers, load = workers or joblib.cpu_count(), os.getloadavg()[0]
-    everything, together = groups(), Case("C2IQL", TASKS[0])
+    everything, parts = groups(), []
+    folder.mkdir(parents=True, exist_ok=True)
+
+    def write(name: str, tables: list[pd.DataFrame]) -> None:
+        pd.concat(tables).to_csv(folder / FILES[name], index=False, float_format="%.6g")
+
+    write("machine", [machine(device, load)])
     total = (rounds + 1) * sum(map(len, everything.values())) + 10 * len(TASKS)
     with tqdm(total=total, desc="measuring", leave=False) as bar:
-        parts = [
-            measure(cases, rounds, seconds, device, bar.update, missing).assign(group=name)
-            for name, cases in everything.items()
-        ]
+        for name, cases in everything.items():
+            parts.append(measure(cases, rounds, seconds, device, bar.update, missing).assign(group=name))
+            write("updates", parts)
         if load > BUSY:
             missing(f"{workers} processes at once: not measured, the machine is busy (load {load:.1f})")
         else:
-            parts.append(side_by_side(together, workers, rounds).assign(group="processes"))
+            together = side_by_side(Case("C2IQL", TASKS[0]), workers, rounds)
+            write("updates", [*parts, together.assign(group="processes")])
         rollouts = [simulation(get_task(task), workers, 1, bar.update).assign(task=task) for task in TASKS]
-    tables = {
-        "updates": pd.concat(parts, ignore_index=True),
-        "simulation": pd.concat(rollouts, ignore_index=True),
-        "machine": machine(device, load),
-    }
-    folder.mkdir(parents=True, exist_ok=True)
-    for name, table in tables.items():
-        table.to_csv(folder / FILES[name], index=False, float_format="%.6g")
-    return [folder / FILES[name] for name in tables]
+        write("simulation", rollouts)
+    return [folder / file for file in FILES.values()]
 
 
 def machine(device, load: float) -> pd.DataFrame:

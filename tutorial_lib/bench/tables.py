@@ -12,7 +12,7 @@ from tutorial_lib.datasets import SHIPPED_DATA
 from tutorial_lib.tasks import get_task
 
 FOLDER = SHIPPED_DATA / "results" / "bench"
-FILES = {name: f"{name}.csv" for name in ("updates", "simulation", "machine")}
+FILES = {name: f"{name}.csv" for name in ("machine", "updates", "simulation")}
 NOT_RUN = "*Not measured: `c2iql bench --full` does it.*"
 OURS, SMALL = "C2IQL", f"C2IQL, its reconstruction model {SMALL_CRM}"
 NAMES = {  # what stands in the table: (what, products, crm)

@@ -37,6 +37,6 @@ def speed(updates):
         right.plot(counts, costs, **looks, label=f"profile {profile}")
     right.plot(counts, counts, **DASHED, label="one after the other")
     right.set(xlabel="seeds trained together", ylabel="time per update, x one seed", xticks=counts)
-    right.set(title="Seeds together")
+    right.set(title="Seeds together", ylim=(0, 1.4 * max(counts)))
     right.legend()
     return figure
