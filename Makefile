@@ -67,11 +67,12 @@ notebooks: $(EXECUTED)
 # The kernel warns at every start that it talks in plain text, unless it need not.
 QUIETLY := --log-level=ERROR --KernelManager.transport_encryption=auto
 
-# A notebook runs in its own folder. What stays of it: outputs and counts, and no trace of the machine.
+# A notebook runs in its own folder. What stays of it: outputs and counts, and no trace of the machine. A cell
+# that takes ten minutes hangs.
 build/pages/%.ipynb: %.ipynb $(WHAT_NOTEBOOKS_USE) $(READY)
 	@mkdir -p $(@D)
 	@printf '%-50s' $<; start=$$(date +%s); \
-	$(BIN) -m nbconvert $(QUIETLY) --to notebook --execute --output-dir $(@D) $< && \
+	$(BIN) -m nbconvert $(QUIETLY) --ExecutePreprocessor.timeout=600 --to notebook --execute --output-dir $(@D) $< && \
 	$(BIN) -m nbstripout --keep-output --keep-count --keep-id --extra-keys metadata.language_info $@ && \
 	echo "$$(($$(date +%s) - start)) s"
 
