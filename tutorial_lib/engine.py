@@ -27,8 +27,8 @@ tensor given back to the system and asked for again: half of an update's time.""
 def connect(scheduler: str | None = None, workers: int | None = None) -> Iterator[Client]:
     """A client of the scheduler at this address, or of one process per core here, each with one thread.
 
-    The workers of a scheduler elsewhere need this project installed, its data, and the folder of the runs
-    under the same path.
+    The workers of a scheduler elsewhere need this project installed, its data, the folder of the runs under
+    the same path, and the environment that `ONE_THREAD` speaks of.
     """
     with contextlib.ExitStack() as stack:
         if scheduler is None:
