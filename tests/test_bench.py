@@ -1,11 +1,11 @@
 """What is timed is what is said: the plain version against the library's updates, the turns, the tables."""
 
 import dataclasses
-import os
 import subprocess
 
 import numpy as np
 import pandas as pd
+import psutil
 import pytest
 import torch
 
@@ -277,10 +277,10 @@ def folder(tmp_path, monkeypatch):
     )
     monkeypatch.setattr(cases, "stopwatch", Watch)
     monkeypatch.setattr(bench, "simulation", lambda *_: one)
-    monkeypatch.setattr(os, "getloadavg", lambda: (3.0, 0, 0))
+    monkeypatch.setattr(psutil, "cpu_percent", lambda interval: 30.0)
     said = []
     bench.full(tmp_path, workers=2, rounds=2, missing=said.append)
-    assert said == ["2 processes at once: not measured, the machine is busy (load 3.0)"]
+    assert said == ["2 processes at once: not measured, others take 30% of the cores"]
     return tmp_path
 
 
@@ -314,7 +314,7 @@ def test_tables_by_hand(folder):
     assert set(tables.by_part(found)["sampling"]) == {"20%"}
     assert tables.growth(found)["growth"].str.startswith(("10 x as many", "8 x", "100 x")).all()
     assert tables.rollouts(tables.load("simulation", folder))["s per episode"].tolist() == ["0.500", "0.300"]
-    assert "load before the start 3.0" in tables.circumstances(tables.load("machine", folder))
+    assert "busy before the start 30%" in tables.circumstances(tables.load("machine", folder))
 
 
 def test_two_processes_are_compared_by_the_clock(monkeypatch):

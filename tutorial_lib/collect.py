@@ -65,7 +65,7 @@ RECIPES = {
     # DSRL's numbers of episodes would make these files larger than all others together.
     "DroneRun": Recipe(episodes=640, steps=2_000_000, width=128, **_RUN),
     "AntRun": Recipe(episodes=340, steps=3_000_000, width=128, **_RUN),
-    "DroneCircle": Recipe(episodes=410, steps=3_000_000, width=128),
+    "DroneCircle": Recipe(episodes=410, steps=4_000_000, width=128, ramp=(0.5, 0.75)),
 }
 
 

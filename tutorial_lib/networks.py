@@ -14,7 +14,9 @@ from tutorial_lib.config import Config
 def mlp(inputs: int, width: int, layers: int, outputs: int) -> nn.Sequential:
     """`layers` hidden layers of `width` ReLU units, and a linear output."""
     sizes = [inputs] + [width] * layers
-    hidden = [m for i, o in zip(sizes, sizes[1:], strict=False) for m in (nn.Linear(i, o), nn.ReLU())]
+    hidden = [
+        m for i, o in zip(sizes, sizes[1:], strict=False) for m in (nn.Linear(i, o), nn.ReLU(inplace=True))
+    ]
     return nn.Sequential(*hidden, nn.Linear(sizes[-1], outputs))
 
 
@@ -102,7 +104,7 @@ class Critics(nn.Module):
     def forward(self, observations: Tensor, actions: Tensor) -> Tensor:
         x = torch.cat([observations, actions], -1).expand(self.k, -1, -1)
         for layer in self.layers[:-1]:
-            x = F.relu(layer(x))
+            x = F.relu(layer(x), inplace=True)
         return _scaled(self.layers[-1](x), self.scale)
 
 

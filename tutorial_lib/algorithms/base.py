@@ -163,7 +163,8 @@ class Agent:
         noise = zip(*[self.draw_noise(g, size) for g in generators], strict=True)  # by kind, not by run
         noise = [torch.stack(runs).to(self.device, non_blocking=True) for runs in noise]
         if len(self.seeds) == 1:  # the same function without the lift, which is not free
-            squeezed = _map(self.parameters, lambda p: p[0]), _map(self.target_parameters, lambda p: p[0])
+            lent = self.parameters, self.target_parameters
+            squeezed = (_map(p, lambda x: x.squeeze(0)) for p in lent)  # x[0] would have its gradient copied
             own = Batch(*(x[0] for x in batch)), limits[0], *(x[0] for x in noise)
             loss, scalars = self._total(*squeezed, *own)
             scalars = {name: value[None] for name, value in scalars.items()}

@@ -4,7 +4,6 @@
 how cost grows with seeds, batch and data, in some minutes. Tables and figure of speed are made of its files.
 """
 
-import os
 import platform
 from collections.abc import Callable
 from datetime import date
@@ -13,6 +12,7 @@ from pathlib import Path
 
 import joblib
 import pandas as pd
+import psutil
 import torch
 from tqdm.auto import tqdm
 
@@ -25,8 +25,8 @@ from tutorial_lib.config import PROFILES
 from tutorial_lib.tasks import Task, get_task
 
 __all__ = ["PARTS", "bench", "full", "install", "machine", "training"]
-BUSY = 0.5
-"""Load per machine, before the start, from which two processes are not compared with one."""
+BUSY = 10
+"""Percent of the cores' time that others take, from which two processes are not compared with one."""
 
 
 def bench(
@@ -76,22 +76,23 @@ def full(
     device="cpu",
     missing: Callable[[str], object] = tqdm.write,
 ) -> list[Path]:
-    """Measure everything and write `folder`'s files: machine, updates, simulation. Returns their paths."""
-    workers, load = workers or joblib.cpu_count(), os.getloadavg()[0]
+    """Measure everything on one thread and write `folder`'s files, whose paths it returns."""
+    torch.set_num_threads(1)
+    workers, busy = workers or joblib.cpu_count(), psutil.cpu_percent(interval=1)
     everything, parts = groups(), []
     folder.mkdir(parents=True, exist_ok=True)
 
     def write(name: str, tables: list[pd.DataFrame]) -> None:
         pd.concat(tables).to_csv(folder / FILES[name], index=False, float_format="%.6g")
 
-    write("machine", [machine(device, load)])
+    write("machine", [machine(device, busy)])
     total = (rounds + 1) * sum(map(len, everything.values())) + 10 * len(TASKS)
     with tqdm(total=total, desc="measuring", leave=False) as bar:
         for name, cases in everything.items():
             parts.append(measure(cases, rounds, seconds, device, bar.update, missing).assign(group=name))
             write("updates", parts)
-        if load > BUSY:
-            missing(f"{workers} processes at once: not measured, the machine is busy (load {load:.1f})")
+        if busy > BUSY:
+            missing(f"{workers} processes at once: not measured, others take {busy:.0f}% of the cores")
         else:
             together = side_by_side(Case("C2IQL", TASKS[0]), workers, rounds)
             write("updates", [*parts, together.assign(group="processes")])
@@ -100,7 +101,7 @@ def full(
     return [folder / file for file in FILES.values()]
 
 
-def machine(device, load: float) -> pd.DataFrame:
+def machine(device, busy: float) -> pd.DataFrame:
     """What the numbers hold for: one row per fact."""
     lines = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else []
     names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
@@ -111,7 +112,7 @@ def machine(device, load: float) -> pd.DataFrame:
         "instructions": torch.backends.cpu.get_cpu_capability(),
         "device": torch.cuda.get_device_name() if str(device) == "cuda" else "cpu",
         "threads": torch.get_num_threads(),
-        "load before the start": f"{load:.1f}",
+        "busy before the start": f"{busy:.0f}%",
         "system": platform.system(),
         "Python": platform.python_version(),
         **{name: version(name) for name in ("torch", "numpy", "pybullet")},

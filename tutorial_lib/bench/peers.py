@@ -25,7 +25,7 @@ PACKAGES = (
     "d3rlpy==2.8.1",
     # What d3rlpy asks for and the course does not have. (OSRL's own list pins an old PyTorch: not installed.)
     *("gym==0.26.2", "gym_notices", "structlog", "colorama", "dataclasses-json", "marshmallow"),
-    *("typing-inspect", "mypy-extensions", "scikit-learn", "threadpoolctl"),
+    *("typing-inspect", "mypy-extensions", "scikit-learn", "narwhals", "threadpoolctl"),
 )
 
 

@@ -29,11 +29,12 @@ def simulation(
         ("bare simulator", 1): lambda: _play("bare", task.name, actions),
         ("our environment", 1): lambda: _play("ours", task.name, actions),
         ("rollouts", 1): lambda: _rollouts(agent, 1),
-        ("rollouts", workers): lambda: _rollouts(agent, workers),
         ("bare simulator", workers): lambda: _play_beside("bare", task.name, actions, workers),
+        # Played first, as joblib replaces processes that come to need much more memory than at first.
+        ("rollouts", workers): lambda: _rollouts(agent, workers),
     }
     speeds = np.zeros((rounds + 1, len(cases)))
-    for turn in range(rounds + 1):  # the first turn is a warm-up: processes start, simulators are built
+    for turn in range(rounds + 1):  # the first, backwards, warms up: processes start, simulators are built
         order = list(enumerate(cases.values()))
         for column, case in order if turn % 2 else reversed(order):
             started = time.perf_counter()
