@@ -65,8 +65,8 @@ RECIPES = {
     # DSRL's numbers of episodes would make these files larger than all others together.
     "DroneRun": Recipe(episodes=640, steps=2_000_000, width=128, **_RUN),
     "AntRun": Recipe(episodes=340, steps=3_000_000, width=128, **_RUN),
-    # Not good enough yet, and not shipped: without prices returns rise to 730 in 1.3 million steps, then falls
-    # become frequent; stopped at 3.1 million, below three quarters of DSRL's returns at every limit. Perhaps
+    # Not good enough yet, so not shipped: without prices returns rise to 730 in 1.3 million steps, then falls
+    # become frequent; after 2.7 million it was below three quarters of DSRL's returns at every limit. Perhaps
     # the learning rate is too high for so long a run.
     "DroneCircle": Recipe(episodes=410, steps=4_000_000, width=128, ramp=(0.5, 0.75)),
 }
