@@ -116,7 +116,7 @@ def test_it_runs_as_a_module():
     [
         (["train", "BallRum"], "unknown task 'BallRum': did you mean BallRun"),
         (["fetch", "Hopper"], "unknown task 'Hopper'"),
-        (["collect", "AntCircle"], "AntCircle has no recipe yet"),
+        (["collect", "AntCircl"], "unknown task 'AntCircl': did you mean AntCircle"),
         (["bench", "--task", "Ball"], "unknown task 'Ball'"),
         (["train", "BallRun", "--algorithm", "SAC"], "unknown algorithm 'SAC': the algorithms are IQL"),
         (["train", "BallRun", "--profile", "huge"], "unknown profile 'huge': the profiles are paper, small"),

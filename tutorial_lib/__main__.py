@@ -66,7 +66,7 @@ def collect(
     """
     from tutorial_lib import collect as collecting  # pulls in stable-baselines3: slow to import
 
-    recipe = collecting.get_recipe(get_task(task))
+    recipe = collecting.RECIPES[get_task(task).name]
     changes = {"steps": steps, "episodes": episodes}
     recipe = dataclasses.replace(
         recipe, **{key: value for key, value in changes.items() if value is not None}

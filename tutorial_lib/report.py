@@ -19,7 +19,6 @@ from tutorial_lib.studies import STUDIES, get_study
 from tutorial_lib.tasks import TASKS, get_task
 
 ROOT = SHIPPED_DATA.parent
-FIRST_LIGHT = RESULTS / "first-light.csv"
 
 DSRL_FRONTIER = {
     "BallRun": {0: 440, 20: 450, 50: 900, 80: 1300},
@@ -64,20 +63,11 @@ def frontier() -> str:
     return markdown(pd.DataFrame(rows))
 
 
-def newest_results() -> pd.DataFrame:
-    """C2IQL on every task: the study of Table 1, and the first runs for the tasks that it does not have."""
-    studied, first = load_results("table1"), pd.read_csv(FIRST_LIGHT)
-    studied = studied[studied["algorithm"] == "C2IQL"]
-    parts = [studied, first[~first["task"].isin(studied["task"])]]
-    results = pd.concat([part for part in parts if len(part)], ignore_index=True)
-    return results.sort_values("task", key=lambda column: column.map(list(TASKS).index), kind="stable")
-
-
 def results_table(results: pd.DataFrame | None = None) -> str:
     """C2IQL per task: scores per threshold with 95% intervals, and the paper's mean beside ours."""
-    results = newest_results() if results is None else results
+    results = load_results("table1") if results is None else results
     rows = []
-    for task, part in results.groupby("task", sort=False):
+    for task, part in results[results["algorithm"] == "C2IQL"].groupby("task", sort=False):
         scores, row = with_scores(part), {"task": task, "seeds": part["seed"].nunique()}
         for _, line in summarise(part).iterrows():
             limit = get_task(task).cost_limit_names[line["threshold"]]
@@ -92,8 +82,7 @@ def results_table(results: pd.DataFrame | None = None) -> str:
 
 def baselines_table() -> str:
     """Our algorithms on all tasks, what was not run, and the paper's: mean reward / mean cost."""
-    ours = pd.concat([newest_results(), load_results("table1").query("algorithm != 'C2IQL'")])
-    found = over_seeds(ours).set_index(["algorithm", "task"])
+    found = over_seeds(load_results("table1")).set_index(["algorithm", "task"])
     run = found.index.get_level_values(0).unique()
     missing = [name for name in ("BC-All", "BC-Safe", *TABLE1) if name not in run]
     rows = []
