@@ -76,6 +76,28 @@ def test_thinning_is_even_over_cost_and_within_a_cost_over_return(seed, n):
     assert min(n, len(allowed)) <= len(kept) < min(n, len(allowed)) + len(columns)
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_thinning_keeps_the_cheapest_episode_of_the_frontier_in_every_cell_it_takes_from(seed):
+    rng = np.random.default_rng(seed)
+    costs = rng.integers(0, 81, 600)
+    returns = 5 * costs + rng.uniform(0, 100, 600)  # what is spent earns, so nearly every cost has its best
+    kept = set(thin(costs, returns, 200, max_cost=80, max_return=1_000).tolist())
+    everyone, low, high = range(600), returns.min(), returns.max()
+    frontier = [
+        i for i in everyone if not any(costs[j] <= costs[i] and returns[j] > returns[i] for j in everyone)
+    ]
+
+    def cell(i):
+        return min(int(costs[i] / 4), 19), min(int((returns[i] - low) / (high - low) * 20), 19)
+
+    first = {}
+    for i in sorted(frontier, key=lambda i: costs[i]):
+        first.setdefault(cell(i), i)
+    taken = {cell(i) for i in kept}
+    assert sum(place in taken for place in first) > 20
+    assert all(i in kept for place, i in first.items() if place in taken)
+
+
 def test_thinning_draws_at_random_within_a_cell_and_alike_every_time():
     costs, returns = np.zeros(1_000), np.full(1_000, 7.0)  # all in one cell
     kept = thin(costs, returns, 100, 80, 1_000, seed=1)

@@ -119,6 +119,13 @@ def test_the_named_studies_are_made_of_known_options_algorithms_and_tasks():
         studies.get_study("ablation")
 
 
+def test_only_options_that_differ_within_a_grid_are_columns():
+    longer = Grid(("AntRun",), options=({"steps": 9},))
+    two = Grid(options=({"kappa_1": 0.5}, {"kappa_1": 0.7, "crm": "linear"}), at_test=({},))
+    rules = Grid(at_test=({"infinite_at_test": "never"}, {"infinite_at_test": "nearest"}))
+    assert studies.varied_options(Study("?", (longer, two, rules))) == ("kappa_1", "crm", "infinite_at_test")
+
+
 def test_the_studies_that_the_paper_has_are_the_papers():
     kappas = {(c.config.kappa_1, c.config.kappa_2) for c in studies.cells(studies.STUDIES["kappas"])}
     assert kappas == {(a, b) for a in (0.5, 0.7, 0.9) for b in (0.5, 0.7, 0.9)}
@@ -269,4 +276,35 @@ def test_a_killed_worker_loses_no_cell_and_changes_no_number(data, tmp_path, cli
 def test_agents_of_the_small_profile_that_are_shipped_would_be_found():
     """They are an equal run of the study table1 if their data and recipe are today's."""
     for cell in studies.cells(studies.STUDIES["table1"], "C2IQL"):
-        assert cell.config == PROFILES["small"] and cell.threshold is None
+        steps = 36_000 if cell.task in ("AntRun", "DroneCircle", "AntCircle") else 12_000
+        assert cell.config == dataclasses.replace(PROFILES["small"], steps=steps) and cell.threshold is None
+
+
+def test_results_of_cells_that_are_not_here_are_kept_in_the_grids_order(data, tmp_path):
+    """A clone has the results of all cells and the runs of none."""
+    chosen = make_cells(Grid(("BallRun",), ("C2IQL", "BC-Safe", "IQL")), data)
+    folder, path = tmp_path / "study", tmp_path / "all.csv"
+    folder.mkdir()
+
+    def finish(cell, cost):
+        limits = (30, 50, 70) if cell.threshold is None else (cell.threshold,)
+        rows = [
+            {"task": cell.task, "algorithm": cell.algorithm, "threshold": x, "cost": cost} for x in limits
+        ]
+        pd.DataFrame(rows).to_csv(results_path(cell, folder), index=False)
+
+    for cost, cell in enumerate(chosen):
+        finish(cell, cost)
+    assert collect(chosen, folder, path) == len(chosen) == 5
+    whole = path.read_text()
+    for file in folder.glob("*.csv"):
+        file.unlink()
+    assert collect(chosen, folder, path, keep=True) == 0 and path.read_text() == whole
+    finish(chosen[2], 9)  # BC-Safe at 50
+    assert collect(chosen, folder, path, keep=True) == 1
+    rows = pd.read_csv(path)
+    assert rows["algorithm"].tolist() == ["C2IQL"] * 3 + ["BC-Safe"] * 3 + ["IQL"] * 3
+    found = rows.set_index(["algorithm", "threshold"])["cost"]
+    assert found["BC-Safe"].to_dict() == {30: 1, 50: 9, 70: 3} and found["C2IQL"].tolist() == [0, 0, 0]
+    assert found["IQL"].tolist() == [4, 4, 4]
+    assert collect(chosen, folder, path) == 1 and len(pd.read_csv(path)) == 1

@@ -187,8 +187,8 @@ def study(
         return
     with engine.connect(scheduler, workers) as client:
         failures = engine.run_cells(chosen, folder, client)
-    done = cells.collect(grid, folder, out)
-    print(f"{out}: {done} of {len(grid)} cells")
+    done = cells.collect(grid, folder, out, keep=not trial)
+    print(f"{out}: {done} of {len(grid)} cells are finished here")
     for cell, reason in failures.items():
         print(f"FAILED {cell}: {reason}")
     if failures:

@@ -143,9 +143,22 @@ def _read(value: str):
         return value
 
 
-def collect(chosen: list[Cell], folder: Path, path: Path) -> int:
-    """Stack the results of the cells that are finished into one CSV. Returns how many cells it holds."""
+def collect(chosen: list[Cell], folder: Path, path: Path, keep: bool = False) -> int:
+    """Stack the results of the cells that are finished in `folder` into one CSV. Returns how many they are.
+
+    `keep` the rows that the CSV already has of other cells: a clone has the results, but not the runs.
+    """
     done = [results_path(cell, folder) for cell in chosen if results_path(cell, folder).exists()]
-    if done:
-        save_results(pd.concat([pd.read_csv(file) for file in done], ignore_index=True), path)
+    if not done:
+        return 0
+    results = pd.concat([pd.read_csv(file) for file in done], ignore_index=True)
+    if keep and path.exists():
+        before = pd.read_csv(path)
+        key = ["task", "algorithm", "threshold", *chosen[0].columns]
+        again = pd.MultiIndex.from_frame(before[key]).isin(pd.MultiIndex.from_frame(results[key]))
+        results = pd.concat([before[~again], results], ignore_index=True)
+        place = {(cell.task, cell.algorithm): i for i, cell in reversed(list(enumerate(chosen)))}
+        rows = pd.Series(zip(results["task"], results["algorithm"], strict=True)).map(place)
+        results = results.iloc[rows.argsort(kind="stable")]
+    save_results(results, path)
     return len(done)
