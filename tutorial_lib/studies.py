@@ -49,24 +49,21 @@ SIZES = ({"crm": "linear"}, {"crm_width": 16, "crm_layers": 1}, {"crm_width": 64
 ABLATIONS = ("C2IQL", "C2IQL w/o CR", "C2IQL w/o CC", "CIQL")
 PAIR = ("BallRun", "CarCircle")  # the shortest horizon and the longest: gamma^T is 0.01 and 0.05
 
-SLOW = ("AntRun", "DroneCircle", "AntCircle")
-"""Tasks where profile `small` needs three times its updates: single actions hardly show in what is paid."""
-LONGER = ({"steps": 36_000},)
-REST = tuple(task for task in TASKS if task not in SLOW)
+OWN_OPTIONS = {"AntRun": {"unsafe_price": 20.0}}
+"""What a task changes in the profile. One action of an ant's gait hardly shows in its cost: at profile
+`small`'s price of 6 an agent paid 43 under a limit of 30."""
 
 STUDIES: dict[str, Study] = {
     "table1": Study(
         "The paper's Table 1: how much reward at how much cost, on every task whose data is shipped?",
         (
-            Grid(REST, ("C2IQL",), seeds=5),
-            Grid(SLOW, ("C2IQL",), LONGER, seeds=5),
-            Grid(REST, ("BC-All", "BC-Safe", "CPQ")),
-            Grid(SLOW, ("BC-All", "BC-Safe", "CPQ"), LONGER),
+            *(Grid((task,), ("C2IQL",), (OWN_OPTIONS.get(task, {}),), seeds=5) for task in TASKS),
+            Grid(tuple(TASKS), ("BC-All", "BC-Safe", "CPQ")),
         ),
     ),
     "ablations": Study(
         "Figures 3 and 7: what do cost reconstruction and constraint conditioning each add?",
-        (Grid(("CarCircle", "BallCircle"), ABLATIONS), Grid(("DroneCircle",), ABLATIONS, LONGER)),
+        (Grid(("CarCircle", "BallCircle", "DroneCircle"), ABLATIONS),),
     ),
     "kappas": Study(
         "Figure 4: what do the two expectiles do?",
