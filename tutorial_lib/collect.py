@@ -74,8 +74,8 @@ RECIPES = {
     "DroneRun": Recipe(episodes=640, steps=2_000_000, width=128, **_RUN),
     "AntRun": Recipe(episodes=340, steps=3_000_000, **_LONG, **_RUN),
     "DroneCircle": Recipe(episodes=410, steps=4_000_000, ramp=(0.25, 0.6), **_LONG),
-    # Not carried to its end, so nothing is shipped: after 600,000 steps the ant walked and earned 19, but half
-    # of its episodes ended in a fall.
+    # Not carried to its end, so nothing is shipped: after 600,000 steps the ant earned 19, and half of its
+    # episodes ended in a fall.
     "AntCircle": Recipe(episodes=130, steps=3_000_000, ramp=(0.25, 0.6), **_LONG),
 }
 

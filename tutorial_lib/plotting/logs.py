@@ -14,23 +14,12 @@ from tutorial_lib.plotting.style import (
     legend_below,
     one_figure,
     subplots,
+    task_panels,
 )
 from tutorial_lib.report import DSRL_FRONTIER
 from tutorial_lib.tasks import Task, get_task
 
 DOTS = {"marker": "o", "linestyle": "none", "markersize": 3, "alpha": 0.4, "markeredgewidth": 0}
-
-
-def _panels(datasets, height: float, **options):
-    """One panel per dataset, four in a row, each with its task's name; empty places stay empty."""
-    columns = min(4, len(datasets))
-    lines = -(-len(datasets) // columns)
-    figure, axes = subplots(lines, columns, figsize=(12, height * lines), squeeze=False, **options)
-    for ax, name in zip(axes.flat, datasets, strict=False):
-        ax.set_title(name)
-    for ax in axes.flat[len(datasets) :]:
-        ax.set_visible(False)
-    return figure, axes
 
 
 @one_figure
@@ -40,7 +29,7 @@ def planes(datasets: dict, frontier: bool = False):
     `frontier` adds the best return left under each limit, the best mixture of episodes, and DSRL's frontier
     where it is known.
     """
-    figure, axes = _panels(datasets, 3.6)
+    figure, axes = task_panels(datasets, 3.6)
     for ax, (name, data) in zip(axes.flat, datasets.items(), strict=False):
         task = get_task(name)
         ax.plot(data.episode_costs, data.episode_returns, color=NEUTRAL, label="episode", **DOTS)
@@ -92,7 +81,7 @@ def filtered(dataset, task: Task, limit: float):
 @one_figure
 def visited(datasets: dict):
     """Where the robot was after each recorded step, as steps per bin; lines mark the cost zones."""
-    figure, axes = _panels(datasets, 3.5)
+    figure, axes = task_panels(datasets, 3.5)
     for ax, (name, data) in zip(axes.flat, datasets.items(), strict=False):
         x, y = positions(data).T
         run = "Run" in name
@@ -117,7 +106,7 @@ def visited(datasets: dict):
 @one_figure
 def examples_left(datasets: dict, share: float = 0.9):
     """Episodes that pass each threshold's filter, and those of them that earn nearly the best return left."""
-    figure, axes = _panels(datasets, 3.4)
+    figure, axes = task_panels(datasets, 3.4)
     for ax, (name, data) in zip(axes.flat, datasets.items(), strict=False):
         thresholds = get_task(name).thresholds
         left = [np.sum(data.episode_costs <= limit) for limit in thresholds]

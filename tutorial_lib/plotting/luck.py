@@ -16,6 +16,7 @@ from tutorial_lib.plotting.style import (
     legend_below,
     one_figure,
     subplots,
+    task_panels,
 )
 from tutorial_lib.results import seed_interval
 from tutorial_lib.tasks import get_task
@@ -95,9 +96,9 @@ def room_left(results):
     """Per task and limit: the best recorded episode within the limit, and what the algorithms earn there."""
     scored = with_scores(results)
     tasks = list(scored["task"].unique())
-    figure, axes = subplots(1, len(tasks), figsize=(max(12, 3 * len(tasks)), 4.4), sharey=True, squeeze=False)
+    figure, axes = task_panels(tasks, 3.6, sharey=True)
     looks = algorithm_looks(scored)
-    for ax, name in zip(axes[0], tasks, strict=True):
+    for ax, name in zip(axes.flat, tasks, strict=False):
         task, data = get_task(name), load_dataset(name)
         best = normalised_return(best_left(data, task.thresholds)[1], task)
         ax.plot(range(3), best, "_", color=LIMIT, markersize=40, markeredgewidth=3, label="best recorded")
@@ -107,7 +108,9 @@ def room_left(results):
             if means.notna().any():
                 ax.plot(range(3), means, **looks[algorithm], linewidth=1.5, label=algorithm)
         ax.set_xticks(range(3), [f"{limit:g}" for limit in task.thresholds])
-        ax.set(title=name, xlabel="limit", xlim=(-0.5, 2.5))
-    axes[0, 0].set(ylabel="normalised return", ylim=(0, None))
+        ax.set(xlabel="limit", xlim=(-0.5, 2.5))
+    axes[0, 0].set_ylim(0, None)
+    for ax in axes[:, 0]:
+        ax.set_ylabel("normalised return")
     legend_below(figure, *axes[0])
     return figure

@@ -19,6 +19,7 @@ from tutorial_lib.plotting.style import (
     legend_below,
     one_figure,
     subplots,
+    task_panels,
 )
 from tutorial_lib.results import options_of, seed_interval, seed_means
 from tutorial_lib.tasks import get_task
@@ -226,8 +227,8 @@ def promises(results):
     results = results[results["algorithm"].eq("C2IQL") & results["predicted_cost"].notna()]
     means = results.groupby(["task", "seed", "threshold"])[["predicted_cost", "cost"]].mean().reset_index()
     tasks = list(results["task"].unique())
-    figure, axes = subplots(1, len(tasks), figsize=(max(12, 3 * len(tasks)), 4.4), squeeze=False)
-    for ax, task in zip(axes[0], tasks, strict=True):
+    figure, axes = task_panels(tasks, 3.8)
+    for ax, task in zip(axes.flat, tasks, strict=False):
         part, names = means[means["task"] == task], get_task(task).cost_limit_names
         end = 1.1 * part[["predicted_cost", "cost", "threshold"]].to_numpy().max()
         ax.plot([0, end], [0, end], color=NEUTRAL, linewidth=1.5, label="paid as predicted")
@@ -236,9 +237,10 @@ def promises(results):
             style = {"color": COST, "alpha": alpha, "markersize": 9, "label": f"{name} limit"}
             ax.plot(rows["predicted_cost"], rows["cost"], mark, **style)
             ax.axhline(limit, color=LIMIT, linestyle=":", linewidth=1, label="the limits")
-        ax.set(title=task, xlabel="predicted cost", xlim=(0, end), ylim=(0, end))
+        ax.set(xlabel="predicted cost", xlim=(0, end), ylim=(0, end))
         ax.locator_params(nbins=4)
-    axes[0, 0].set_ylabel("paid cost")
+    for ax in axes[:, 0]:
+        ax.set_ylabel("paid cost")
     legend_below(figure, axes[0, 0])
     return figure
 

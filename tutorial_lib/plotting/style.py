@@ -63,6 +63,18 @@ def one_figure(draw):
     return in_style
 
 
+def task_panels(tasks, height: float, **options):
+    """One panel per task name, four in a row; empty places stay empty."""
+    columns = min(4, len(tasks))
+    lines = -(-len(tasks) // columns)
+    figure, axes = subplots(lines, columns, figsize=(12, height * lines), squeeze=False, **options)
+    for ax, name in zip(axes.flat, tasks, strict=False):
+        ax.set_title(name)
+    for ax in axes.flat[len(tasks) :]:
+        ax.set_visible(False)
+    return figure, axes
+
+
 def legend_below(figure, *axes):
     entries = {
         label: handle for ax in axes for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)
