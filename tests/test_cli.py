@@ -233,7 +233,7 @@ def test_study(c2iql, tmp_path, small_study):
     assert status == 0 and f"{tmp_path}/quick.csv: 1 of 1 cells" in out
     results = pd.read_csv(tmp_path / "quick.csv")
     assert set(results["threshold"]) == {25} and set(results["updates"]) == {2}
-    assert set(results["kappa_1"]) == {0.6} and len(results) == 10
+    assert len(results) == 10 and "kappa_1" not in results  # the cell is called after it, but nothing varies
     status, out, _ = c2iql(*trial, "--list")
     assert status == 0 and "done    BallRun-C2IQL-kappa_1=0.6" in out
 
