@@ -142,8 +142,9 @@ def test_the_studies_that_the_paper_has_are_the_papers():
 
 
 def test_a_cells_results_are_those_of_training_and_evaluating_by_hand(data, tmp_path):
-    grid = Grid(("BallRun",), options=({"kappa_1": 0.55},), seeds=2, limits=(25.0,))
-    (cell,) = make_cells(grid, data, episodes=2)
+    options = ({"kappa_1": 0.55}, {"kappa_1": 0.6})
+    grid = Grid(("BallRun",), options=options, seeds=2, limits=(25.0,))
+    cell, _ = make_cells(grid, data, episodes=2)
     heard = []
     results = pd.read_csv(run_cell(cell, tmp_path / "runs" / "study", heard.append))
     assert list(results.columns) == [*COLUMNS, "kappa_1"] and set(results["kappa_1"]) == {0.55}
