@@ -310,3 +310,8 @@ def test_results_of_cells_that_are_not_here_are_kept_in_the_grids_order(data, tm
     assert found["BC-Safe"].to_dict() == {30: 1, 50: 9, 70: 3} and found["C2IQL"].tolist() == [0, 0, 0]
     assert found["IQL"].tolist() == [4, 4, 4]
     assert collect(chosen, folder, path) == 1 and len(pd.read_csv(path)) == 1
+
+    with pytest.raises(ValueError, match="all.csv has no column kappa_1, so it is of another study"):
+        other = dataclasses.replace(chosen[2], columns=("kappa_1",))
+        finish(other, 9)
+        collect([other], folder, path, keep=True)

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import torch
 from safetensors import SafetensorError, safe_open
@@ -147,6 +148,7 @@ def collect(chosen: list[Cell], folder: Path, path: Path, keep: bool = False) ->
     """Stack the results of the cells that are finished in `folder` into one CSV. Returns how many they are.
 
     `keep` the rows that the CSV already has of other cells: a clone has the results, but not the runs.
+    Raises ValueError where these rows are of a study with other options.
     """
     done = [results_path(cell, folder) for cell in chosen if results_path(cell, folder).exists()]
     if not done:
@@ -155,10 +157,15 @@ def collect(chosen: list[Cell], folder: Path, path: Path, keep: bool = False) ->
     if keep and path.exists():
         before = pd.read_csv(path)
         key = ["task", "algorithm", "threshold", *chosen[0].columns]
+        if missing := set(key) - set(before.columns):
+            raise ValueError(
+                f"{path} has no column {', '.join(sorted(missing))}, so it is of another study: move it away"
+            )
         again = pd.MultiIndex.from_frame(before[key]).isin(pd.MultiIndex.from_frame(results[key]))
         results = pd.concat([before[~again], results], ignore_index=True)
         place = {(cell.task, cell.algorithm): i for i, cell in reversed(list(enumerate(chosen)))}
-        rows = pd.Series(zip(results["task"], results["algorithm"], strict=True)).map(place)
-        results = results.iloc[rows.argsort(kind="stable")]
+        pairs = zip(results["task"], results["algorithm"], strict=True)
+        rows = [place.get(pair, len(chosen)) for pair in pairs]  # tasks that the grid lost come last
+        results = results.iloc[np.argsort(rows, kind="stable")]
     save_results(results, path)
     return len(done)

@@ -37,7 +37,7 @@ class Recipe:
     """About how many episodes the dataset keeps: DSRL's number, or what 15 to 20 MB hold."""
     return_cells: int = 20
     """Episodes of like cost are thinned evenly over so many cells of return. 1: by chance, so that experts
-    are as frequent as in the run; where one episode in thirty is kept, they would be too few otherwise."""
+    are as frequent as in the run; where one episode in forty is kept, they would be too few otherwise."""
     steps: int = 2_000_000
     """Simulator steps of one PPO run."""
     prices: tuple[float, float] = (0.02, 4.0)
