@@ -110,11 +110,12 @@ def get_study(name: str) -> Study:
 
 def varied_options(study: Study) -> tuple[str, ...]:
     """The options that differ between the cells of a grid: columns of the study's results."""
-    varied = {}
-    for changes in (changes for grid in study.grids for changes in (grid.options, grid.at_test)):
-        names = dict.fromkeys(name for options in changes for name in options)
-        varied |= {n: None for n in names if len({options.get(n) for options in changes}) > 1}
-    return tuple(varied)
+    varied = []
+    for grid in study.grids:
+        for changes in (grid.options, grid.at_test):
+            names = (name for options in changes for name in options)
+            varied += [name for name in names if len({options.get(name) for options in changes}) > 1]
+    return tuple(dict.fromkeys(varied))
 
 
 def cells(

@@ -26,8 +26,7 @@ DOTS = {"marker": "o", "linestyle": "none", "markersize": 3, "alpha": 0.4, "mark
 def planes(datasets: dict, frontier: bool = False):
     """Every episode of every dataset {task name: Dataset} by cost and return, thresholds dashed.
 
-    `frontier` adds the best return left under each limit, the best mixture of episodes, and DSRL's frontier
-    where it is known.
+    `frontier` adds the best return left under each limit, the best mixture of episodes, and DSRL's frontier.
     """
     figure, axes = task_panels(datasets, 3.6)
     for ax, (name, data) in zip(axes.flat, datasets.items(), strict=False):
@@ -40,9 +39,8 @@ def planes(datasets: dict, frontier: bool = False):
             ax.plot(limits, best_left(data, limits)[1], color=REWARD, label="best episode left")
             mix = {"color": REWARD, "linewidth": 1.5, "linestyle": ":"}
             ax.plot(limits, best_mixture(data, limits), label="best mixture", **mix)
-            for marks in [DSRL_FRONTIER[name]] if name in DSRL_FRONTIER else []:
-                mark = {"color": COST, "markersize": 9, "label": "DSRL's frontier, read off its plots"}
-                ax.plot(list(marks), list(marks.values()), "D", **mark)
+            mark = {"color": COST, "markersize": 9, "label": "DSRL's frontier, read off its plots"}
+            ax.plot(*zip(*DSRL_FRONTIER[name].items(), strict=True), "D", **mark)
         ax.set(xlabel="cost", xticks=[0, *task.thresholds])
     for ax in axes[:, 0]:
         ax.set_ylabel("return")
