@@ -19,7 +19,7 @@ import pytest
 from safetensors.numpy import load_file
 
 from tutorial_lib import collect as collecting
-from tutorial_lib.collect import RECIPES, PricedCost, Recipe, run_ppo, thin
+from tutorial_lib.collect import RECIPES, PricedCost, Recipe, along_own_axes, run_ppo, thin
 from tutorial_lib.datasets import read_dataset
 from tutorial_lib.tasks import TASKS
 
@@ -183,6 +183,46 @@ def test_prices_and_allowances_are_drawn_from_their_ranges():
 def test_while_unsafe_steps_are_free_nothing_is_charged():
     env, _ = priced([1, 1], Recipe(episodes=1, allowance_share=0.0), price_scale=0.0)
     assert rewards_of(env)[1] == pytest.approx([200 / 1327.4456] * 2)
+
+
+# --- The robot's own axes ---
+
+
+def body_axes(attitude):
+    """The body's axes in the world, as columns, by the textbook's formula for a quaternion (x, y, z, w)."""
+    x, y, z, w = attitude
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_own_axes_are_the_bodys(seed):
+    observation = np.random.default_rng(seed).normal(size=34)
+    observation[6:10] /= np.linalg.norm(observation[6:10])
+    axes, seen = body_axes(observation[6:10]), along_own_axes(observation)
+    x, y = observation[:2]
+    vectors = [observation[3:6], observation[10:13], np.array([0, 0, 1]), np.array([x, y, 0])]
+    expected = [vector @ axis for vector in vectors for axis in axes.T]
+    np.testing.assert_allclose(seen, [*observation[:3], *expected, *observation[13:]], atol=1e-12)
+
+
+def test_an_ant_that_starts_along_the_circle_has_the_centre_on_its_right():
+    recipe = replace(RECIPES["AntCircle"], allowance_share=0.0)
+    env = PricedCost(TASKS["AntCircle"], recipe, np.random.default_rng(0), [])
+    for _ in range(3):
+        seen, _ = env.reset()
+        assert env.observation_space.contains(seen)
+        distance = math.hypot(*env.env.position)
+        assert 2 <= distance <= 4
+        assert seen[9:12] == pytest.approx([0, 0, 1], abs=0.01)  # the sky is above
+        assert seen[12:15] == pytest.approx([0, distance / 10, 0], abs=0.01)  # the centre is opposite
+        assert seen.shape == (34 + 2 + 2,) and env.observation.shape == (34,)  # which is what is recorded
+    env.close()
 
 
 # --- Killed and resumed ---

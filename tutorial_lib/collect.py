@@ -20,6 +20,7 @@ import joblib
 import numpy as np
 import torch
 from safetensors.numpy import load_file, save_file
+from scipy.spatial.transform import Rotation
 from tqdm.auto import tqdm
 
 from tutorial_lib.datasets import Dataset, write_dataset
@@ -58,6 +59,9 @@ class Recipe:
     """Steps between two PPO updates, over 16 environments."""
     width: int = 64
     """Of PPO's two hidden layers."""
+    own_axes: bool = False
+    """PPO sees the world along the axes of the robot's body, so that a gait learned in one direction serves in
+    all. The data keeps the simulator's observations."""
 
 
 _RUN = {"prices": (0.2, 1.5), "allowance_share": 1.0, "allowances": (-0.2, 1.0), "ramp": None}
@@ -74,9 +78,10 @@ RECIPES = {
     "DroneRun": Recipe(episodes=640, steps=2_000_000, width=128, **_RUN),
     "AntRun": Recipe(episodes=340, steps=3_000_000, **_LONG, **_RUN),
     "DroneCircle": Recipe(episodes=410, steps=4_000_000, ramp=(0.25, 0.6), **_LONG),
-    # Not carried to its end, so nothing is shipped: after 600,000 steps the ant earned 19, and half of its
-    # episodes ended in a fall.
-    "AntCircle": Recipe(episodes=130, steps=3_000_000, ramp=(0.25, 0.6), **_LONG),
+    # After 800,000 steps the ant earned 114 and fell in 10% of the episodes; along the world's axes 25 and 42%.
+    "AntCircle": Recipe(
+        episodes=130, steps=5_000_000, ramp=(0.3, 0.6), learning_rate=(1e-3, 6.5e-4), own_axes=True, **_LONG
+    ),
 }
 
 
@@ -87,7 +92,7 @@ class PricedCost(gymnasium.Wrapper):
         super().__init__(make_env(task))
         self.task, self.recipe, self.rng, self.episodes = task, recipe, rng, episodes
         self.price_scale = 0.0
-        limit = np.append(self.env.observation_space.high, [1000.0, 1000.0]).astype(np.float32)
+        limit = np.full(task.obs_dim + (2 if recipe.own_axes else 0) + 2, 1000.0, np.float32)
         self.observation_space = gymnasium.spaces.Box(-limit, limit)
 
     def reset(self, *, seed=None, options=None):
@@ -116,7 +121,21 @@ class PricedCost(gymnasium.Wrapper):
 
     def _augmented(self):
         left = max(self.allowance, 0.0) / self.task.cost_range
-        return np.append(self.observation, [self.log_price, 2 * left]).astype(np.float32)
+        seen = along_own_axes(self.observation) if self.recipe.own_axes else self.observation
+        return np.append(seen, [self.log_price, 2 * left]).astype(np.float32)
+
+
+def along_own_axes(observation: np.ndarray) -> np.ndarray:
+    """What an ant or a drone observes (obs,), told along the axes of its body (obs + 2,).
+
+    Their observations begin with the position in tens of metres, the velocity, the attitude (a quaternion) and
+    the angular velocity. The position stays, for costs lie at fixed places; the attitude becomes the direction of
+    the sky and, along the body's axes as well, the position on the ground.
+    """
+    position, velocity, attitude, spin, rest = np.split(observation, [3, 6, 10, 13])
+    world = np.array([velocity, spin, (0, 0, 1), (*position[:2], 0)])
+    own = Rotation.from_quat(attitude).inv().apply(world)
+    return np.concatenate([position, own.ravel(), rest])
 
 
 def run_ppo(task: Task, recipe: Recipe, seed: int, folder: Path, slice_steps: int = 100_000) -> None:
