@@ -367,7 +367,7 @@ def test_every_run_draws_its_limits_from_its_own_generator():
 @pytest.mark.parametrize("name", ALGORITHMS)
 def test_a_threshold_is_given_where_it_is_needed_and_nowhere_else(name):
     kind = get_algorithm(name)
-    takes_one = name in ("CIQL", "C2IQL w/o CC", "BC-Safe", "CPQ")
+    takes_one = name in ("CIQL", "C2IQL w/o CC", "BC-Safe", "CPQ", "CPQ w/ push")
     assert kind(TASK, CONFIG, threshold=0 if takes_one else None).threshold == (0.0 if takes_one else None)
     with pytest.raises(ValueError, match=name):
         kind(TASK, CONFIG, threshold=None if takes_one else 3.0)

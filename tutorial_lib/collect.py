@@ -60,8 +60,8 @@ class Recipe:
     width: int = 64
     """Of PPO's two hidden layers."""
     own_axes: bool = False
-    """PPO sees the world along the axes of the robot's body, so that a gait learned in one direction serves in
-    all. The data keeps the simulator's observations."""
+    """PPO sees the world along the axes of the robot's body, so that a gait learned in one direction serves
+    in all. The data keeps the simulator's observations."""
 
 
 _RUN = {"prices": (0.2, 1.5), "allowance_share": 1.0, "allowances": (-0.2, 1.0), "ramp": None}
@@ -78,7 +78,8 @@ RECIPES = {
     "DroneRun": Recipe(episodes=640, steps=2_000_000, width=128, **_RUN),
     "AntRun": Recipe(episodes=340, steps=3_000_000, **_LONG, **_RUN),
     "DroneCircle": Recipe(episodes=410, steps=4_000_000, ramp=(0.25, 0.6), **_LONG),
-    # After 800,000 steps the ant earned 114 and fell in 10% of the episodes; along the world's axes 25 and 42%.
+    # After 800,000 steps the ant earned 114 and fell in 10% of the episodes; along the world's axes, 25 and
+    # 42%.
     "AntCircle": Recipe(
         episodes=130, steps=5_000_000, ramp=(0.3, 0.6), learning_rate=(1e-3, 6.5e-4), own_axes=True, **_LONG
     ),
@@ -128,9 +129,9 @@ class PricedCost(gymnasium.Wrapper):
 def along_own_axes(observation: np.ndarray) -> np.ndarray:
     """What an ant or a drone observes (obs,), told along the axes of its body (obs + 2,).
 
-    Their observations begin with the position in tens of metres, the velocity, the attitude (a quaternion) and
-    the angular velocity. The position stays, for costs lie at fixed places; the attitude becomes the direction of
-    the sky and, along the body's axes as well, the position on the ground.
+    Their observations begin with the position in tens of metres, the velocity, the attitude (a quaternion)
+    and the angular velocity. The position stays, for costs lie at fixed places; the attitude becomes the
+    direction of the sky and, along the body's axes as well, the position on the ground.
     """
     position, velocity, attitude, spin, rest = np.split(observation, [3, 6, 10, 13])
     world = np.array([velocity, spin, (0, 0, 1), (*position[:2], 0)])

@@ -53,12 +53,17 @@ OWN_OPTIONS = {"AntRun": {"unsafe_price": 20.0}}
 """What a task changes in the profile. One action of an ant's gait hardly shows in its cost: at profile
 `small`'s price of 6 an agent paid 43 under a limit of 30."""
 
+SLOW_TARGETS = {"target_tau": 0.01}
+"""For an actor that asks about its own actions: on BallCircle at 50, CPQ (seed 0) had a normalised reward and
+cost of 0.57 / 0.96 with it, and 0.26 / 0.49 with profile `small`'s 0.1."""
+
 STUDIES: dict[str, Study] = {
     "table1": Study(
         "The paper's Table 1: how much reward at how much cost, on every task whose data is shipped?",
         (
             *(Grid((task,), ("C2IQL",), (OWN_OPTIONS.get(task, {}),), seeds=5) for task in TASKS),
-            Grid(tuple(TASKS), ("BC-All", "BC-Safe", "CPQ")),
+            Grid(tuple(TASKS), ("BC-All", "BC-Safe")),
+            Grid(tuple(TASKS), ("CPQ",), (SLOW_TARGETS,)),
         ),
     ),
     "ablations": Study(

@@ -7,11 +7,12 @@ from tutorial_lib.algorithms.base import Agent
 from tutorial_lib.algorithms.bc import BCAll, BCSafe
 from tutorial_lib.algorithms.c2iql import C2IQL, C2IQLWithoutCC, C2IQLWithoutCR
 from tutorial_lib.algorithms.ciql import CIQL
-from tutorial_lib.algorithms.cpq import CPQ
+from tutorial_lib.algorithms.cpq import CPQ, PushedCPQ
 from tutorial_lib.algorithms.iql import IQL
 
 ALGORITHMS: dict[str, type[Agent]] = {
-    agent.name: agent for agent in (IQL, CIQL, C2IQLWithoutCR, C2IQLWithoutCC, C2IQL, BCAll, BCSafe, CPQ)
+    agent.name: agent
+    for agent in (IQL, CIQL, C2IQLWithoutCR, C2IQLWithoutCC, C2IQL, BCAll, BCSafe, CPQ, PushedCPQ)
 }
 
 

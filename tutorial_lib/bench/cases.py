@@ -31,7 +31,7 @@ def groups() -> dict[str, list[Case]]:
         ours = [Case("C2IQL", task), Case("C2IQL", task, products="default")]
         ours += [Case("C2IQL", task, crm=SMALL_CRM), Case("C2IQL", task, products="bfloat16")]
         plain = [Case(EAGER, task, products="default"), Case(EAGER, task)]
-        others = [Case("IQL", task), Case("CPQ", task)]
+        others = [Case("IQL", task), Case("CPQ w/ push", task)]
         others += [Case(name, task, products="default") for name in PEERS]
         return product + ours + plain + others
 

@@ -23,7 +23,7 @@ NAMES = {  # what stands in the table: (what, products, crm)
     "plain eager C2IQL, our products": (EAGER, "float32", "5 x 512"),
     EAGER: (EAGER, "default", "5 x 512"),
     "our IQL": ("IQL", "float32", "5 x 512"),
-    "our CPQ": ("CPQ", "float32", "5 x 512"),
+    "our CPQ, with its push": ("CPQ w/ push", "float32", "5 x 512"),
     **{name: (name, "default", "5 x 512") for name in PEERS},
 }
 
