@@ -329,6 +329,16 @@ def test_target_kl_stops_the_epochs_early():
     assert stopped <= 2
 
 
+def test_a_calm_run_ends_with_little_noise(tmp_path):
+    """Two slices, calm from the second on; an untrained policy's mean actions are near zero."""
+    run_ppo(BALL, replace(RECIPE, calm=(0.5, 0.1)), 0, tmp_path, slice_steps=SLICE)
+    slices = [load_file(path)["actions"] for path in sorted(tmp_path.glob("episodes-*"))]
+    early, late = (actions.std() for actions in slices)
+    assert early == pytest.approx(math.exp(-0.5), abs=0.1) and 0.09 < late < 0.45
+    log_std = load_file(tmp_path / "state.safetensors")["policy.log_std"]
+    assert (log_std < math.log(0.1) + 0.05).all()
+
+
 def test_every_task_has_a_recipe():
     assert RECIPES.keys() == TASKS.keys()
 

@@ -53,6 +53,9 @@ class Recipe:
     hard to unlearn."""
     learning_rate: tuple[float, float] = (1e-3, 3e-4)
     """PPO's learning rate at the first and at the last step."""
+    calm: tuple[float, float] | None = None
+    """From this share of the run on, actions have at most this noise (standard deviation): a robot that
+    stumbles over its own exploration shows less than it can. None: as PPO likes."""
     target_kl: float | None = None
     """PPO goes over a batch ten times, or until the policy has moved 1.5 times this far (KL divergence)."""
     batch_steps: int = 4096
@@ -81,7 +84,14 @@ RECIPES = {
     # After 800,000 steps the ant earned 114 and fell in 10% of the episodes; along the world's axes, 25 and
     # 42%.
     "AntCircle": Recipe(
-        episodes=130, steps=5_000_000, ramp=(0.3, 0.6), learning_rate=(1e-3, 6.5e-4), own_axes=True, **_LONG
+        episodes=130,
+        steps=6_000_000,
+        ramp=(0.25, 0.5),
+        learning_rate=(1e-3, 5.8e-4),
+        own_axes=True,
+        # With half of its noise it earned a fifth more and fell less: 195 and 17% for 163 and 28%.
+        calm=(0.76, 0.2),
+        **_LONG,
     ),
 }
 
@@ -164,6 +174,8 @@ def run_ppo(task: Task, recipe: Recipe, seed: int, folder: Path, slice_steps: in
         clock["progress"] = index / slices
         scale = 1.0 if recipe.ramp is None else np.interp(clock["progress"], recipe.ramp, (0, 1))
         model.env.set_attr("price_scale", float(scale))
+        if recipe.calm is not None and clock["progress"] >= recipe.calm[0]:
+            model.policy.log_std.data.clamp_(max=np.log(recipe.calm[1]))
         model.learn(goal - model.num_timesteps, reset_num_timesteps=False)
         arrays = {name: np.concatenate([e[name] for e in episodes]) for name in FIELDS}
         episodes.clear()
