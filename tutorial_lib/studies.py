@@ -49,9 +49,12 @@ SIZES = ({"crm": "linear"}, {"crm_width": 16, "crm_layers": 1}, {"crm_width": 64
 ABLATIONS = ("C2IQL", "C2IQL w/o CR", "C2IQL w/o CC", "CIQL")
 PAIR = ("BallRun", "CarCircle")  # the shortest horizon and the longest: gamma^T is 0.01 and 0.05
 
-OWN_OPTIONS = {"AntRun": {"unsafe_price": 20.0}}
+OWN_OPTIONS = {
+    "AntRun": {"unsafe_price": 20.0},
+    "AntCircle": {"unsafe_price": 200.0, "time_limits": "mask"},
+}
 """What a task changes in the profile. One action of an ant's gait hardly shows in its cost: at profile
-`small`'s price of 6 an agent paid 43 under a limit of 30."""
+`small`'s price of 6 an agent paid 43 under AntRun's limit of 30, and 122 under AntCircle's of 40."""
 
 SLOW_TARGETS = {"target_tau": 0.01}
 """For an actor that asks about its own actions: on BallCircle at 50, CPQ (seed 0) had a normalised reward and
