@@ -276,7 +276,7 @@ def test_a_killed_worker_loses_no_cell_and_changes_no_number(data, tmp_path, cli
 
 def test_agents_of_the_small_profile_that_are_shipped_would_be_found(tmp_path):
     """They are an equal run of the study table1 if their data and recipe are today's."""
-    ants = {"AntRun": {"unsafe_price": 20.0}, "AntCircle": {"unsafe_price": 200.0, "time_limits": "mask"}}
+    ants = {"AntRun": {"unsafe_price": 20.0}, "AntCircle": {"unsafe_price": 200.0, "crm_noise_rate": 0.05}}
     for cell in studies.cells(studies.STUDIES["table1"], "C2IQL"):
         assert cell.config == dataclasses.replace(PROFILES["small"], **ants.get(cell.task, {}))
         assert cell.threshold is None
