@@ -276,9 +276,10 @@ def test_a_killed_worker_loses_no_cell_and_changes_no_number(data, tmp_path, cli
 
 def test_agents_of_the_small_profile_that_are_shipped_would_be_found(tmp_path):
     """They are an equal run of the study table1 if their data and recipe are today's."""
-    ants = {"AntRun": {"unsafe_price": 20.0}, "AntCircle": {"unsafe_price": 200.0, "crm_noise_rate": 0.05}}
+    own = {"AntRun": {"unsafe_price": 20.0}, "AntCircle": {"unsafe_price": 200.0, "crm_noise_rate": 0.05}}
+    own["DroneRun"] = {"time_limits": "mask"}
     for cell in studies.cells(studies.STUDIES["table1"], "C2IQL"):
-        assert cell.config == dataclasses.replace(PROFILES["small"], **ants.get(cell.task, {}))
+        assert cell.config == dataclasses.replace(PROFILES["small"], **own.get(cell.task, {}))
         assert cell.threshold is None
         assert find_trained(cell, tmp_path / "runs" / "study") is not None
 

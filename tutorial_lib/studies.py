@@ -50,13 +50,15 @@ ABLATIONS = ("C2IQL", "C2IQL w/o CR", "C2IQL w/o CC", "CIQL")
 PAIR = ("BallRun", "CarCircle")  # the shortest horizon and the longest: gamma^T is 0.01 and 0.05
 
 OWN_OPTIONS = {
+    "DroneRun": {"time_limits": "mask"},
     "AntRun": {"unsafe_price": 20.0},
     "AntCircle": {"unsafe_price": 200.0, "crm_noise_rate": 0.05},
 }
-"""What a task changes in the profile. One action of an ant's gait hardly shows in its cost. At profile
-`small`'s price of 6 an agent paid 43 under AntRun's limit of 30. On AntCircle one paid 98 under 40: its
-critics' heads differ mostly by error, and a reconstruction model that is told so (with the price, five
-seeds) made that 55."""
+"""What a task changes in the profile. DroneRun's agents stayed below the speed limit whatever they might
+spend, at a normalised reward of 0.61 under a limit of 110; with masked time limits they have 0.70. One
+action of an ant's gait hardly shows in its cost: at profile `small`'s price of 6 an agent paid 43 under
+AntRun's limit of 30, and 98 under AntCircle's of 40. There the critics' heads differ mostly by error, and a
+reconstruction model that is told so (with the price, five seeds) made that 55."""
 
 SLOW_TARGETS = {"target_tau": 0.01}
 """For an actor that asks about its own actions: on BallCircle at 50, CPQ (seed 0) had a normalised reward and
