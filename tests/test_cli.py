@@ -204,6 +204,15 @@ def test_train_and_evaluate(c2iql, data, tmp_path):
     assert status == 1 and "is of another run" in err.splitlines()[-1]
 
 
+def test_train_says_what_the_results_agents_have_that_this_one_has_not(c2iql, data, tmp_path, monkeypatch):
+    monkeypatch.setitem(cli.OWN_OPTIONS, "BallRun", {"unsafe_price": 20.0, "time_limits": "mask"})
+    train = ["train", "BallRun", "--data", data, "--option", *TINY, "steps=1", "unsafe_price=20"]
+    said = "BallRun in the results have options of their own: --option unsafe_price=20.0 time_limits=mask"
+    assert said in c2iql(*train, "--out", tmp_path / "without")[1]
+    assert "of their own" not in c2iql(*train, "time_limits=mask", "--out", tmp_path / "with")[1]
+    assert "of their own" not in c2iql(*train, "--algorithm", "IQL", "--out", tmp_path / "IQL")[1]
+
+
 @pytest.fixture
 def small_study(monkeypatch):
     """A study of the shipped data that takes a second."""

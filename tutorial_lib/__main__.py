@@ -20,6 +20,7 @@ from tutorial_lib.algorithms import get_algorithm
 from tutorial_lib.config import Config, get_profile
 from tutorial_lib.datasets import fetch_dataset, load_dataset
 from tutorial_lib.products import Precision
+from tutorial_lib.studies import OWN_OPTIONS
 from tutorial_lib.tasks import TASKS, get_task
 
 Positional = tyro.conf.Positional
@@ -110,6 +111,10 @@ def train(
         or Path("runs") / record.name / f"{algorithm.replace(' ', '-').replace('/', '')}{suffix}-{profile}"
     )
     agent = kind(record, config, seeds=seeds, threshold=threshold, device=check_device(device))
+    own = OWN_OPTIONS.get(record.name, {}) if (algorithm, profile) == ("C2IQL", "small") else {}
+    if any(getattr(config, name) != value for name, value in own.items()):
+        words = " ".join(f"{name}={value}" for name, value in own.items())
+        print(f"The agents of {record.name} in the results have options of their own: --option {words}")
     training.train(agent, load_dataset(record, data), run_dir=out, precision=precision)
     training.save_agent(agent, out / "agent.safetensors")
     print(
