@@ -205,7 +205,7 @@ def test_train_and_evaluate(c2iql, data, tmp_path):
 
 
 def test_train_says_what_the_results_agents_have_that_this_one_has_not(c2iql, data, tmp_path, monkeypatch):
-    monkeypatch.setitem(cli.OWN_OPTIONS, "BallRun", {"unsafe_price": 20.0, "time_limits": "mask"})
+    monkeypatch.setitem(cli.studies.OWN_OPTIONS, "BallRun", {"unsafe_price": 20.0, "time_limits": "mask"})
     train = ["train", "BallRun", "--data", data, "--option", *TINY, "steps=1", "unsafe_price=20"]
     said = "BallRun in the results have options of their own: --option unsafe_price=20.0 time_limits=mask"
     assert said in c2iql(*train, "--out", tmp_path / "without")[1]

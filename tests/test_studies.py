@@ -9,12 +9,13 @@ import time
 import numpy as np
 import pandas as pd
 import pytest
+import torch
 
 from tutorial_lib import cells as cells_module
 from tutorial_lib import engine, studies, training
 from tutorial_lib.cells import collect, find_trained, results_path, run_cell
 from tutorial_lib.config import PROFILES, Config
-from tutorial_lib.datasets import Dataset, read_dataset, write_dataset
+from tutorial_lib.datasets import SHIPPED_DATA, Dataset, load_dataset, read_dataset, write_dataset
 from tutorial_lib.evaluation import evaluate
 from tutorial_lib.studies import Grid, Study
 
@@ -282,6 +283,28 @@ def test_agents_of_the_small_profile_that_are_shipped_would_be_found(tmp_path):
         assert cell.config == dataclasses.replace(PROFILES["small"], **own.get(cell.task, {}))
         assert cell.threshold is None
         assert find_trained(cell, tmp_path / "runs" / "study") is not None
+
+
+def test_the_shipped_antcircle_agent_learns_from_the_cheaper_episodes():
+    """What `data/README.md` says of its reconstruction's weights, and of what its policy learns from."""
+    agent = training.load_agent(SHIPPED_DATA / "agents" / "AntCircle.safetensors")
+    data = load_dataset("AntCircle")
+    batch, limit = data.tensors(), torch.full((len(data),), 40.0)
+    s, s_next = (agent.network_input(x, limit) for x in (batch.observations, batch.next_observations))
+    with torch.no_grad():
+        q_cost, v_cost = agent.network("cost_critics")(s, batch.actions), agent.network("cost_value")(s)
+        follows = (1 - batch.terminals)[:, None] * agent.network("cost_value")(s_next)
+        step = batch.costs[:, None] + agent.gammas * follows
+        cost = torch.stack([agent.episode_cost(x) for x in (*q_cost, step)]).amax(0)
+        q = agent.penalised_q(agent.network("critics")(s, batch.actions).amin(0), cost, v_cost, limit)
+        kept = (q >= agent.network("value")(s)).numpy()
+    share = [kept[data.episode_index == episode].mean() for episode in range(data.num_episodes)]
+    assert np.corrcoef(share, data.episode_costs)[0, 1] == pytest.approx(-0.55, abs=0.01)
+
+    inputs = q_cost.mean(0).requires_grad_()
+    (slope,) = torch.autograd.grad(agent.episode_cost(inputs).sum(), inputs)
+    weights = (slope / (1 - agent.gammas)).mean(0)
+    np.testing.assert_allclose(weights, [-127, 151, 456], atol=1)
 
 
 def test_results_of_cells_that_are_not_here_are_kept_in_the_grids_order(data, tmp_path):

@@ -15,12 +15,11 @@ import pandas as pd
 import torch
 import tyro
 
-from tutorial_lib import evaluation, training
+from tutorial_lib import evaluation, studies, training
 from tutorial_lib.algorithms import get_algorithm
 from tutorial_lib.config import Config, get_profile
 from tutorial_lib.datasets import fetch_dataset, load_dataset
 from tutorial_lib.products import Precision
-from tutorial_lib.studies import OWN_OPTIONS
 from tutorial_lib.tasks import TASKS, get_task
 
 Positional = tyro.conf.Positional
@@ -111,7 +110,7 @@ def train(
         or Path("runs") / record.name / f"{algorithm.replace(' ', '-').replace('/', '')}{suffix}-{profile}"
     )
     agent = kind(record, config, seeds=seeds, threshold=threshold, device=check_device(device))
-    own = OWN_OPTIONS.get(record.name, {}) if (algorithm, profile) == ("C2IQL", "small") else {}
+    own = studies.OWN_OPTIONS.get(record.name, {}) if (algorithm, profile) == ("C2IQL", "small") else {}
     if any(getattr(config, name) != value for name, value in own.items()):
         words = " ".join(f"{name}={value}" for name, value in own.items())
         print(f"The agents of {record.name} in the results have options of their own: --option {words}")
@@ -177,7 +176,7 @@ def study(
         out: the CSV to write; default data/results/NAME.csv, and in a trial runs/studies/NAME.csv.
         dry: only list the cells, and which of them are finished.
     """
-    from tutorial_lib import cells, engine, results, studies  # pulls in dask
+    from tutorial_lib import cells, engine, results  # pulls in dask
 
     record, folder = studies.get_study(name), runs / name
     changes = (*option, *(() if steps is None else (f"steps={steps}",)))
