@@ -287,7 +287,8 @@ def folder(tmp_path, monkeypatch):
 def test_tables_by_hand(folder):
     found = tables.load("updates", folder)
     rows = tables.yardsticks(found).set_index("profile `paper`")
-    chosen = cases.groups()["yardsticks AntCircle"]
+    everything = cases.groups()
+    chosen = everything["yardsticks AntCircle"]
     place = {(c.what, c.products, c.crm): i + 1 for i, c in enumerate(chosen)}  # milliseconds
     ours, plain = (place[tables.NAMES[name]] for name in ("C2IQL", EAGER))
     row = rows.loc["C2IQL"]
@@ -301,18 +302,19 @@ def test_tables_by_hand(folder):
     marks = tables.marks(found).set_index("mark")
     assert marks.loc["x plain eager, with the same model", "AntCircle"] == f"{plain / ours:.2f}"
     assert marks.loc["two processes on two cores, x one", "AntCircle"] == "not measured"
-    first = sum(
-        len(group) for name, group in cases.groups().items() if name not in ("seeds", "batch", "rows")
-    )
-    five = [c for c in cases.groups()["seeds"] if c.profile == "paper"].index(
-        Case("C2IQL", "AntCircle", runs=5)
-    )
+    before = {name: sum(map(len, list(everything.values())[:i])) for i, name in enumerate(everything)}
+    first = before["seeds"]
+    five = [c for c in everything["seeds"] if c.profile == "paper"].index(Case("C2IQL", "AntCircle", runs=5))
     expected = (first + five + 1) / (first + 1)
     assert marks.loc["cost of five seeds together, x one, profile `paper`", "AntCircle"] == f"{expected:.2f}"
 
     assert tables.by_algorithm(found).shape == (len(ALGORITHMS), 5)
     assert set(tables.by_part(found)["sampling"]) == {"20%"}
-    assert tables.growth(found)["growth"].str.startswith(("10 x as many", "8 x", "100 x")).all()
+    grown = tables.growth(found)
+    sizes, tasks = (grown[(grown["what grows"] == "tasks") == which] for which in (False, True))
+    assert sizes["growth"].str.startswith(("10 x as many", "8 x", "100 x")).all()
+    last = before["tasks"] + 8  # AntCircle's milliseconds, the eighth of them
+    assert tasks["growth"].iloc[0] == f"all 8 cost {sum(range(last - 7, last + 1)) / last:.2f} x AntCircle"
     assert tables.rollouts(tables.load("simulation", folder))["s per episode"].tolist() == ["0.500", "0.300"]
     assert "busy before the start 30%" in tables.circumstances(tables.load("machine", folder))
 

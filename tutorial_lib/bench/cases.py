@@ -16,6 +16,7 @@ from tutorial_lib.algorithms import ALGORITHMS
 from tutorial_lib.bench.peers import PEERS, Peer
 from tutorial_lib.bench.updates import EAGER, PRODUCT, Case, OurUpdates, Steps
 from tutorial_lib.config import PROFILES
+from tutorial_lib.tasks import TASKS as ALL_TASKS
 
 TASKS = ("AntCircle", "CarCircle")
 SMALL_CRM = "3 x 128"
@@ -44,6 +45,7 @@ def groups() -> dict[str, list[Case]]:
         "seeds": [Case("C2IQL", ant, profile, runs) for profile in PROFILES for runs in (1, 2, 5, 10)],
         "batch": [Case("C2IQL", ant, batch=batch) for batch in (128, 256, 512, 1024)],
         "rows": [Case("C2IQL", ant, rows=rows) for rows in (10_000, 100_000, 1_000_000)],
+        "tasks": [Case("C2IQL", task, profile) for profile in PROFILES for task in ALL_TASKS],
     }
 
 

@@ -127,7 +127,10 @@ def by_part(updates: pd.DataFrame) -> pd.DataFrame:
 
 
 def growth(updates: pd.DataFrame) -> pd.DataFrame:
-    """Milliseconds per update as seeds, batch or dataset grow, and the multiple of the first."""
+    """Milliseconds per update as seeds, batch, dataset or tasks grow, and the multiple of the first.
+
+    Tasks are trained one after the other: their sum counts, as a multiple of the largest's, AntCircle's.
+    """
     rows = []
     for group, column in (("seeds", "runs"), ("batch", "batch"), ("rows", "rows")):
         part = updates[updates["group"] == group]
@@ -138,6 +141,12 @@ def growth(updates: pd.DataFrame) -> pd.DataFrame:
             times = f"{sizes[-1] / sizes[0]:g} x as many cost {last:.2f} x"
             row = {"what grows": group, "profile": profile, "ms per update": "; ".join(words)}
             rows.append(row | {"growth": times})
+    for profile, own in updates[updates["group"] == "tasks"].groupby("profile", sort=False):
+        table = own.pivot(index="round", columns="task", values="seconds")[own["task"].unique()]
+        words = [f"{task}: {time * 1e3:.3g}" for task, time in table.median().items()]
+        times = (table.sum(axis=1) / table[TASKS[0]]).median()
+        row = {"what grows": "tasks", "profile": profile, "ms per update": "; ".join(words)}
+        rows.append(row | {"growth": f"all {len(words)} cost {times:.2f} x {TASKS[0]}"})
     return pd.DataFrame(rows)
 
 
