@@ -111,11 +111,16 @@ def least_cost(cmdp):
 
 def implicit_policy(mu, q, v, slope):
     u = np.where(q == v, 1e-6, q - v)
-    return mu * np.abs(slope(u) / u) / (mu * np.abs(slope(u) / u)).sum()
+    return mu * np.abs(slope(u) / u) / (mu * np.abs(slope(u) / u)).sum(-1, keepdims=True)
 
 
 def batched_loss(weight, q_cost, value):
-    return (weight * (q_cost[:, 0] - value) ** 2).mean()
+    return torch.mean(weight * torch.square(q_cost.squeeze(-1) - value))
+
+
+def one_sum_for_all(mu, q, v, slope):
+    u = np.where(q == v, 1e-6, q - v)
+    return mu * np.abs(slope(u) / u) / (mu * np.abs(slope(u) / u)).sum()
 
 
 def unnormalised(mu, q, v, slope):
@@ -168,6 +173,7 @@ MISTAKES = [
     (checks.check_implicit_policy, unnormalised, "divide by the sum"),
     (checks.check_implicit_policy, lambda mu, q, v, f: mu * abs(f(q - v)), "so pi_imp is mu"),
     (checks.check_implicit_policy, at_zero, "take the limit"),
+    (checks.check_implicit_policy, one_sum_for_all, "a sum of its own"),
     (checks.check_batched_loss, lambda w, q, v: (w * (q - v) ** 2).mean(), "two errors, not four"),
     (checks.check_batched_loss, lambda w, q, v: (w * (q - v[:, None]) ** 2).mean(), "its own weight"),
     (checks.check_batched_loss, lambda w, q, v: (w * (q[:, 0] - v) ** 2).sum(), "a mean over"),
@@ -187,6 +193,8 @@ MISTAKES = [
     (checks.check_condition, lambda L, spent, t, T, choices: condition(L, spent, 0, T, choices), "double"),
     (checks.check_condition, lambda L, spent, t, T, choices: condition(L, 0, t, T, choices), "rate of 20"),
     (checks.check_condition, lambda L, spent, t, T, choices: (L - spent) * T / (T - t), "double"),
+    (checks.check_condition, lambda L, spent, t, T, choices: max(
+        [c for c in choices if c <= (L - spent) * T / (T - t)], default=choices[0]), "double"),
 ]  # fmt: skip
 
 

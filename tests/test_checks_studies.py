@@ -39,12 +39,20 @@ CASES = [  # checker, right answer, wrong answers
     (
         checks.check_best_safe,
         best_safe,
-        (lambda r, c: int(r.argmax()), lambda r, c: int(np.where(c < 1, r, -9).argmax())),
+        (
+            lambda r, c: int(r.argmax()),
+            lambda r, c: int(np.where(c < 1, r, -9).argmax()),
+            lambda r, c: int((r * (c <= 1)).argmax()) if (c <= 1).any() else -1,
+        ),
     ),
     (
         checks.check_seed_spread,
         seed_spread,
-        (lambda s: s["score"].std(), lambda s: s.groupby("seed")["score"].mean().std(ddof=0)),
+        (
+            lambda s: s["score"].std(),
+            lambda s: s.groupby("seed")["score"].mean().std(ddof=0),
+            lambda s: s.groupby("seed")["score"].mean().std(),
+        ),
     ),
     (
         checks.check_share_kept,

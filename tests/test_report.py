@@ -37,14 +37,17 @@ def test_every_shipped_dataset_reaches_dsrls_frontier_nearly():
 def test_results_table_by_hand():
     same = {"task": "CarRun", "algorithm": "C2IQL", "profile": "small"}
     rows = [
-        same | {"seed": seed, "threshold": limit, "return": r, "cost": c}
-        for limit, r, c in ((10, 204.2873, 5), (20, 574.6533, 20), (40, 574.6533, 0))
+        same | {"seed": seed, "threshold": limit, "return": r, "cost": c + seed * more + spread}
+        for limit, r, c, more in ((10, 204.2873, 5, 0), (20, 574.6533, 20, 0), (40, 574.6533, 0, 8))
         for seed in (0, 1)
+        for spread in (-1, 1)  # of episodes, which says nothing about other seeds
     ]
     table = report.results_table(pd.DataFrame(rows))
     line = table.splitlines()[2]
     assert "0.00 [0.00, 0.00] / 0.50 [0.50, 0.50]" in line and "1.00 [1.00, 1.00] / 1.00 [1.00, 1.00]" in line
-    assert f"{np.mean([0, 1, 1]):.2f} / {np.mean([0.5, 1, 0]):.2f}" in line and "0.95 / 0.08" in line
+    low, high = 0.1 + 12.706 * 0.1 * np.array([-1, 1])  # two seeds, 0 and 0.2: t of one degree of freedom
+    assert f"1.00 [1.00, 1.00] / 0.10 [{low:.2f}, {high:.2f}]" in line
+    assert f"{np.mean([0, 1, 1]):.2f} / {np.mean([0.5, 1, 0.1]):.2f}" in line and "0.95 / 0.08" in line
 
 
 def test_between_marks_replaces_only_what_is_between():

@@ -72,7 +72,8 @@ def over_seeds(results: pd.DataFrame, by: Sequence[str] = ("task", "algorithm"))
 def difference(results: pd.DataFrame, score: str, high: dict, low: dict | float) -> np.ndarray:
     """The score in the rows `high` minus that in the rows `low`, one value for each seed that has both.
 
-    Runs of one seed share their batches' random numbers and their episodes' starts, so they are paired.
+    Runs of one seed share their episodes' starts, and their batches where they draw the same random numbers
+    (conditioned ones also draw limits), so they are paired.
     """
 
     def of(rows: dict | float, like: pd.Series | None = None) -> pd.Series:

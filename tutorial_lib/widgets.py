@@ -46,7 +46,7 @@ def when_it_falls(gamma: float = 0.99, start: int = 0) -> Controls:
         description="gamma",
         **SLIDER,
     )
-    starts = ipywidgets.IntSlider(start, 0, 260, 5, description="first unsafe step", **SLIDER)
+    starts = ipywidgets.IntSlider(start, 0, 240, 5, description="first unsafe step", **SLIDER)
     return Controls(lambda gamma, start: plotting.falling_cost(gamma, start), gamma=gammas, start=starts)
 
 

@@ -88,7 +88,7 @@ class C2IQL(Agent):
         cost, worst = self.episode_cost(q_cost).max(0)  # (B,)
         q_cost = q_cost.take_along_dim(worst[None, :, None], 0).squeeze(0)  # (B, m)
 
-        # Line 18's target, here already: what the recorded step expects. (Eq. 16 prints V_c(s); s' is meant.)
+        # Line 18: its target, here already: what the recorded step expects. (Eq. 16 prints V_c(s), not s'.)
         cost_target = L.td_target(
             batch.costs[:, None], self.gammas, net.cost_value(s_next), cost_mask[:, None]
         )

@@ -5,8 +5,6 @@ from collections.abc import Callable
 import numpy as np
 
 from tutorial_lib.checks.claims import try_answer
-from tutorial_lib.conditioning import nearest_threshold, rescaled_budget
-from tutorial_lib.tasks import get_task
 
 
 def check_implicit_cost_value(answer: Callable) -> None:
@@ -42,18 +40,26 @@ def check_implicit_cost_value(answer: Callable) -> None:
 
 def check_condition(answer: Callable) -> None:
     """Notebook 08: `answer(limit, spent, t, horizon, thresholds)`, the threshold of eq. 23 for a step."""
-    task = get_task("BallCircle")
-    hints = {
-        (30.0, 0.0, 0): "at the start nothing is spent: the limit itself",
-        (30.0, 0.0, 100): "half the time is left and all of the budget: it counts double",
-        (50.0, 40.0, 100): "10 left for half of the time is a rate of 20 per episode: the nearest is 30",
-        (30.0, 45.0, 150): "overspent: the budget is negative, and the smallest threshold is the nearest",
-        (70.0, 0.0, 199): "near the end eq. 23 grows without bound: the largest threshold is the nearest",
-        (45.0, 5.0, 50): "40 left for three quarters of the time is 53 per episode",
-    }
-    cases = []
-    for (limit, spent, t), hint in hints.items():
-        wish = rescaled_budget(limit, spent, t, task.horizon)
-        expected = float(nearest_threshold(wish, task))
-        cases.append(((limit, spent, t, task.horizon, task.thresholds), expected, hint))
+    choices, cases = (30.0, 50.0, 70.0), []
+    for limit, spent, t, expected, hint in (
+        (30.0, 0.0, 0, 30.0, "at the start nothing is spent: the limit itself"),
+        (34.0, 0.0, 100, 70.0, "half the time is left and all of the budget: it counts double, 68"),
+        (
+            50.0,
+            40.0,
+            100,
+            30.0,
+            "10 left for half of the time is a rate of 20 per episode: the nearest is 30",
+        ),
+        (
+            30.0,
+            45.0,
+            150,
+            30.0,
+            "overspent: the budget is negative, and the smallest threshold is the nearest",
+        ),
+        (70.0, 0.0, 199, 70.0, "near the end eq. 23 grows without bound: the largest is the nearest"),
+        (45.0, 5.0, 50, 50.0, "40 left for three quarters of the time is 53 per episode"),
+    ):
+        cases.append(((limit, spent, t, 200, choices), expected, hint))
     try_answer(answer, cases)

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 
 import numpy as np
+import torch
 
 from tutorial_lib.tabular import CMDP
 from tutorial_lib.tasks import Task
@@ -36,6 +37,8 @@ def check_that(claim: str, holds) -> None:
 
 
 def text(value) -> str:
+    if isinstance(value, torch.Tensor):
+        value = value.detach().numpy()
     if isinstance(value, Task):
         return value.name
     if isinstance(value, CMDP):

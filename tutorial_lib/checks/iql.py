@@ -17,6 +17,7 @@ def check_expectile(answer: Callable) -> None:
             ((np.array([0.0, 1.0]), 0.9), 0.9, "V = (0.1 * 0 + 0.9 * 1) / (0.1 + 0.9)"),
             ((np.array([0.0, 0.0, 0.0, 10.0]), 0.9), 7.5, "V = 9 / (3 * 0.1 + 0.9): divide by the weights"),
             ((np.array([0.0, 4.0, 10.0]), 0.9), 9.4 / 1.1, "V moves, and so does who is better than V"),
+            ((np.arange(10.0), 0.97), 17.33 / 2.18, "repeat until V stops moving: one round is not enough"),
             ((np.array([0.0, 4.0, 10.0]), 0.1), 1.4 / 1.1, "below 0.5 it leans to the worst"),
         ],
     )

@@ -33,5 +33,7 @@ def check_backup_target(answer: Callable) -> None:
             ((1.0, 0.9, 10.0, False, True, True), 10.0, "bootstrap=True looks through a time limit"),
             ((1.0, 0.9, 10.0, False, True, False), 1.0, "bootstrap=False stops at a time limit"),
             ((1.0, 0.9, 10.0, True, True, True), 1.0, "a fall in the last step is still a fall"),
+            ((1.0, 0.9, 10.0, False, False, False), 10.0, "bootstrap=False stops at time limits only"),
+            ((1.0, 0.9, 10.0, True, False, False), 1.0, "after a terminal nothing follows, either way"),
         ],
     )

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 
 import numpy as np
+import torch
 
 from tutorial_lib.checks.claims import try_answer
 
@@ -21,7 +22,7 @@ class _Slope:
 
 
 def check_implicit_policy(answer: Callable) -> None:
-    """Notebook 06: `answer(mu, q, v, slope)`, the implicit policy of Theorem 1 in one state, (A,)."""
+    """Notebook 06: `answer(mu, q, v, slope)`, the implicit policy of Theorem 1: (..., A), v (..., 1)."""
     square = _Slope("2u", lambda u: 2 * u)
     expectile = _Slope("0.7-expectile", lambda u: 2 * np.where(u < 0, 0.3, 0.7) * u)
     linex = _Slope("linex", np.expm1)
@@ -29,6 +30,7 @@ def check_implicit_policy(answer: Callable) -> None:
     weighted = mu * np.array([0.3, 0.7, 0.3])
     u = q - 2.0
     exact, touching = mu * np.expm1(u) / u, mu * np.array([-np.expm1(-3.0) / 3, 1.0, -np.expm1(-6.0) / 6])
+    states, values = np.array([mu, mu]), np.array([[2.0], [2.0]])
     try_answer(
         answer,
         [
@@ -36,12 +38,17 @@ def check_implicit_policy(answer: Callable) -> None:
             ((mu, q, 2.0, expectile), weighted / weighted.sum(), "mu times |f'(u)| / |u| with u = q - v"),
             ((mu, q, 2.0, linex), exact / exact.sum(), "mu times |f'(u)| / |u| with u = q - v"),
             ((mu, q, 4.0, linex), touching / touching.sum(), "one action is worth just v: take the limit 1"),
+            (
+                (states, np.array([q, q]), values, expectile),
+                np.array([weighted, weighted]) / weighted.sum(),
+                "two states: each has a sum of its own, over the last axis",
+            ),
         ],
     )
 
 
 def check_batched_loss(answer: Callable) -> None:
-    """Notebook 06: `answer(weight, q_cost, value)`, eq. 17 for shapes (B,), (B, 1) and (B,)."""
+    """Notebook 06: `answer(weight, q_cost, value)`, eq. 17 for tensors (B,), (B, 1) and (B,)."""
     rng = np.random.default_rng(0)
     weight, q_cost, value = rng.random(5).round(1), rng.random((5, 1)).round(1), rng.random(5).round(1)
     loop = [w * (q[0] - v) ** 2 for w, q, v in zip(weight, q_cost, value, strict=True)]
@@ -52,4 +59,5 @@ def check_batched_loss(answer: Callable) -> None:
         (([1.0, 0.0], [[4.0], [0.0]], [0.0, 0.0]), 8.0, "each error has its own weight: print both shapes"),
         ((weight, q_cost, value), float(np.mean(loop)), "compare with a loop over the transitions"),
     ]
-    try_answer(answer, [(tuple(map(np.array, x)), expected, hint) for x, expected, hint in cases])
+    tensors = [(tuple(torch.tensor(np.array(part)) for part in x), *rest) for x, *rest in cases]
+    try_answer(answer, tensors)

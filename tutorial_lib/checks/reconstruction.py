@@ -25,7 +25,7 @@ def check_flat_weights(answer: Callable) -> None:
         products = np.multiply.outer(gammas, gammas)
         gram = (1 - products**horizon) / (1 - products)
         sums = (1 - np.array(gammas) ** horizon) / (1 - np.array(gammas))
-        cases.append(((gammas, horizon), np.linalg.solve(gram, sums), hint))
+        cases.append(((np.array(gammas), horizon), np.linalg.solve(gram, sums), hint))
     try_answer(answer, cases)
 
 

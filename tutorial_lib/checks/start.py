@@ -48,15 +48,13 @@ def _episode_repeats() -> bool:
 
 def check_keeps_limit(answer: Callable) -> None:
     """Notebook 00: `answer(costs, limit)`, eq. 1: does a policy with these episode costs keep the limit?"""
-    try_answer(
-        answer,
-        [
-            (([20.0, 10.0, 30.0], 30.0), True, "no episode exceeds the limit"),
-            (([20.0, 35.0, 5.0], 30.0), True, "eq. 1 bounds the expectation: one episode may cost more"),
-            (([31.0, 29.0, 30.0], 30.0), True, "eq. 1 says at most: the limit itself is kept"),
-            (([0.0, 0.0, 95.0], 30.0), False, "most episodes are cheap, but their mean is not"),
-        ],
+    cases = (
+        ([20.0, 10.0, 30.0], True, "no episode exceeds the limit"),
+        ([20.0, 35.0, 5.0], True, "eq. 1 bounds the expectation: one episode may cost more"),
+        ([31.0, 29.0, 30.0], True, "eq. 1 says at most: the limit itself is kept"),
+        ([0.0, 0.0, 95.0], False, "most episodes are cheap, but their mean is not"),
     )
+    try_answer(answer, [((np.array(costs), 30.0), expected, hint) for costs, expected, hint in cases])
 
 
 def check_normalised_return(answer: Callable) -> None:

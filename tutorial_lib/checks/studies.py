@@ -28,12 +28,13 @@ def check_paired_interval(answer: Callable) -> None:
 
 
 def check_best_safe(answer: Callable) -> None:
-    """Notebook 09: `answer(rewards, costs)`, the setting of most reward whose cost is at most 1, or None."""
+    """Notebook 09: `answer(rewards, costs)`, the setting of most reward whose cost is at most 1, or -1."""
     cases = []
     for rewards, costs, expected, hint in (
         ([0.5, 0.9, 0.7], [0.4, 0.8, 0.9], 1, "all are safe: the one that earns the most"),
         ([0.5, 0.9, 0.7], [0.4, 1.2, 0.9], 2, "the best earner is unsafe and does not count"),
         ([0.5, 0.9], [0.4, 1.0], 1, "a cost of exactly 1 keeps the limit"),
+        ([-0.2, 0.9], [0.7, 2.0], 0, "returns can be negative: what is unsafe is no candidate, not a zero"),
         ([0.5, 0.9, 0.7], [1.4, 1.2, 1.9], -1, "none is safe: say -1, do not pick the least bad silently"),
     ):
         cases.append(((np.array(rewards), np.array(costs)), expected, hint))
@@ -50,6 +51,11 @@ def check_seed_spread(answer: Callable) -> None:
             {(0, 30): [1], (0, 50): [3], (1, 30): [3], (1, 50): [1]},
             0.0,
             "limits differ, but the seeds' means over limits are equal",
+        ),
+        (
+            {(0, 30): [1, 1, 1], (0, 50): [3], (1, 30): [2], (1, 50): [2]},
+            0.0,
+            "a limit with more episodes counts no more than another: first over episodes, then over limits",
         ),
         (
             {(0, 30): [0], (0, 50): [2], (1, 30): [3], (1, 50): [5], (2, 30): [6], (2, 50): [8]},

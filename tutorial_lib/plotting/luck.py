@@ -18,7 +18,7 @@ from tutorial_lib.plotting.style import (
     subplots,
     task_panels,
 )
-from tutorial_lib.results import seed_interval
+from tutorial_lib.results import SCORES, seed_interval
 from tutorial_lib.tasks import get_task
 
 STUDIES, EPISODES, EPISODE_SPREAD = 20, 30, 0.05
@@ -93,7 +93,10 @@ def lucky_checkpoints(checkpoints: int = 20, episodes: int = 5):
 
 @one_figure
 def room_left(results):
-    """Per task and limit: the best recorded episode within the limit, and what the algorithms earn there."""
+    """Per task and limit: the best recorded episode within the limit, and what the algorithms earn there.
+
+    A hollow mark breaks its limit: what it earns does not count.
+    """
     scored = with_scores(results)
     tasks = list(scored["task"].unique())
     figure, axes = task_panels(tasks, 3.6, sharey=True)
@@ -104,9 +107,12 @@ def room_left(results):
         ax.plot(range(3), best, "_", color=LIMIT, markersize=40, markeredgewidth=3, label="best recorded")
         for algorithm in ("C2IQL", "BC-Safe"):
             part = scored[(scored["task"] == name) & (scored["algorithm"] == algorithm)]
-            means = part.groupby("threshold")["reward_score"].mean().reindex(task.thresholds)
-            if means.notna().any():
-                ax.plot(range(3), means, **looks[algorithm], linewidth=1.5, label=algorithm)
+            means = part.groupby("threshold")[list(SCORES)].mean().reindex(task.thresholds)
+            if means.notna().any(axis=None):
+                look, rewards = looks[algorithm] | {"linewidth": 1.5}, means["reward_score"].to_numpy()
+                ax.plot(range(3), rewards, **look, label=algorithm)
+                unsafe = np.flatnonzero(means["cost_score"] > 1)
+                ax.plot(unsafe, rewards[unsafe], **look | {"linestyle": "", "markerfacecolor": "white"})
         ax.set_xticks(range(3), [f"{limit:g}" for limit in task.thresholds])
         ax.set(xlabel="limit", xlim=(-0.5, 2.5))
     axes[0, 0].set_ylim(0, None)
