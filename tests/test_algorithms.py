@@ -119,7 +119,7 @@ class Slow:
         """What is compared with the limit: a whole episode's cost, from one critic's heads."""
         config = self.agent.config
         gammas = TASK.gammas if self.name in ("C2IQL", "C2IQL w/o CC") else [config.gamma]
-        if config.time_limits == "rate" and self.name != "CIQL":
+        if config.time_limits == "rate":
             heads = [q * (1 - g**T) for q, g in zip(heads, gammas, strict=True)]
         if len(gammas) > 1:
             return self.agent.reconstruction(torch.tensor([heads])).item()
@@ -204,8 +204,6 @@ OPTIONS = [
 @pytest.mark.parametrize("options", OPTIONS, ids=str)
 @pytest.mark.parametrize("name", FAMILY)
 def test_an_updates_losses_are_algorithm_2s(name, options):
-    if name == "CIQL" and "time_limits" in options:
-        pytest.skip("CIQL is the paper's and has no such option")
     agent = make_agent(name, seeds=(0, 1), **options)
     batch, limits = random_batch(1, runs=2), random_limits(2, runs=2)
     if not agent.conditioned:
@@ -221,6 +219,30 @@ def test_an_updates_losses_are_algorithm_2s(name, options):
     for run in (0, 1):
         assert {key: scalars[key][run] for key in slow[run]} == pytest.approx(slow[run], rel=1e-4, abs=1e-4)
         assert {f"{loss}_loss" for loss in NETWORK_OF} & scalars.keys() <= slow[run].keys()
+
+
+class WithoutBoth(get_algorithm("C2IQL")):
+    name = "C2IQL w/o both"
+    conditioned = reconstructs = False
+
+
+@pytest.mark.parametrize("options", OPTIONS, ids=str)
+def test_without_its_two_parts_c2iql_is_ciql(options):
+    """So an ablation compares what it says, and nothing else; from the first guess of the costs on."""
+    config = dataclasses.replace(CONFIG, **options)
+    agents = [
+        kind(TASK, config, seeds=(0,), threshold=LIMIT) for kind in (WithoutBoth, get_algorithm("CIQL"))
+    ]
+    data = toy_dataset()
+    for agent in agents:
+        agent.prepare(data, progress=False)
+    for _ in range(3):
+        batch = random_batch(1)
+        both = [one_update(agent, batch) for agent in agents]
+        assert both[1] == {key: pytest.approx(both[0][key], rel=1e-5) for key in both[1]}
+    parts, whole = (agent.state() for agent in agents)
+    for key, value in whole.items():
+        torch.testing.assert_close(value, parts[key], msg=key)
 
 
 @pytest.mark.parametrize("name", FAMILY)
@@ -278,8 +300,6 @@ def test_a_loss_reaches_its_own_network_and_no_other(name):
 @pytest.mark.parametrize("reward_limits", ["bootstrap", "mask"])
 def test_which_ends_stop_the_bootstrap(name, cost_limits, reward_limits):
     """A backup that stops at an end does not look at the state after it."""
-    if name == "CIQL" and cost_limits == "mask":
-        pytest.skip("CIQL is the paper's and bootstraps")
 
     def losses(flag, moved):
         agent = make_agent(name, time_limits=cost_limits, reward_time_limits=reward_limits)

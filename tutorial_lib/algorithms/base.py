@@ -141,6 +141,22 @@ class Agent:
             ends = torch.maximum(ends, batch.timeouts)
         return 1 - ends
 
+    def cost_mask(self, batch: Batch) -> Tensor:
+        """1 where Q_c bootstraps, 0 where nothing follows, (B,)."""
+        ends = batch.terminals
+        if self.config.time_limits == "mask":
+            ends = torch.maximum(ends, batch.timeouts)
+        return 1 - ends
+
+    def guess_costs(self, dataset: Dataset) -> None:
+        """All cost heads start at the dataset's own cost rate.
+
+        The closer the first guess, the less they disagree while they converge, and a reconstruction lives on
+        their differences.
+        """
+        guess = float(dataset.costs.mean()) * self.task.horizon / self.task.thresholds[1]
+        self.fill_last_bias(("cost_value", "cost_critics"), guess - 1)
+
     def penalised_q(self, q_reward: Tensor, cost: Tensor, value_cost: Tensor, limit: Tensor) -> Tensor:
         """Eq. 11, or our variant with a price: Q_r, episode cost and limit (B,), and V_c's heads (B, m)."""
         if self.config.unsafe_price is None:

@@ -8,6 +8,7 @@ import torch
 from tutorial_lib import losses as L
 from tutorial_lib.algorithms.base import Agent, cost_guess, reward_guess
 from tutorial_lib.conditioning import INFINITE_CODE, threshold_set
+from tutorial_lib.discounting import average_threshold
 from tutorial_lib.networks import Critics, Policy, Value, gaussian_log_prob
 from tutorial_lib.reconstruction import CostReconstruction, train_reconstruction
 
@@ -45,10 +46,7 @@ class C2IQL(Agent):
             self.reconstruction = train_reconstruction(
                 self.task, self.config, dataset, device=self.device, progress=progress
             )
-        # All cost heads start at the dataset's own cost rate: the closer the first guess, the less they
-        # disagree while they converge, and the reconstruction lives on their differences.
-        guess = float(dataset.costs.mean()) * self.task.horizon / self.task.thresholds[1]
-        self.fill_last_bias(("cost_value", "cost_critics"), guess - 1)
+        self.guess_costs(dataset)
 
     def draw_limits(self, generator, batch_size):
         """Line 5. Paper silent on 'per batch' or 'per sample': per sample has the lower variance."""
@@ -73,15 +71,12 @@ class C2IQL(Agent):
             q_cost = q_cost * (1 - gammas**horizon)
         if self.reconstructs:
             return self.reconstruction(q_cost)
-        share = (1 - gammas**horizon) / (1 - gammas) / horizon  # L~ / L, eq. 2
-        return (q_cost / share).squeeze(-1)
+        return q_cost.squeeze(-1) / average_threshold(1.0, self.config.gamma, horizon)  # L~ / L, eq. 2
 
     def losses(self, net, batch, limit):
         config, a = self.config, batch.actions
         s = self.network_input(batch.observations, limit)
         s_next = self.network_input(batch.next_observations, limit)  # the same limit: it stands for a rate
-        mask = 1 - batch.terminals
-        cost_mask = mask * (1 - batch.timeouts) if config.time_limits == "mask" else mask
 
         # Lines 6-8: cost reconstruction. Of the ensemble, the critic that expects the most cost counts.
         q_cost = net.target_cost_critics(s, a)  # (k, B, m)
@@ -89,9 +84,8 @@ class C2IQL(Agent):
         q_cost = q_cost.take_along_dim(worst[None, :, None], 0).squeeze(0)  # (B, m)
 
         # Line 18: its target, here already: what the recorded step expects. (Eq. 16 prints V_c(s), not s'.)
-        cost_target = L.td_target(
-            batch.costs[:, None], self.gammas, net.cost_value(s_next), cost_mask[:, None]
-        )
+        mask = self.cost_mask(batch)[:, None]
+        cost_target = L.td_target(batch.costs[:, None], self.gammas, net.cost_value(s_next), mask)
         if config.recorded_step:
             cost = torch.maximum(cost, self.episode_cost(cost_target.detach()))
 

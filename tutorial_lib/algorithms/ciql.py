@@ -26,19 +26,25 @@ class CIQL(Agent):
             "policy": Policy(task.obs_dim, task.act_dim, config),
         }
 
+    def prepare(self, dataset, progress=True):
+        super().prepare(dataset, progress)
+        self.guess_costs(dataset)
+
     def episode_cost(self, q_cost):
         """Discounted costs (..., 1) over L~ / L (eq. 2), (...,): comparing them with L is Q_c against L~."""
-        return q_cost.squeeze(-1) / average_threshold(1.0, self.config.gamma, self.task.horizon)
+        gamma, horizon = self.config.gamma, self.task.horizon
+        if self.config.time_limits == "rate":  # bootstrapped for ever: keep the first T steps' share
+            q_cost = q_cost * (1 - gamma**horizon)
+        return q_cost.squeeze(-1) / average_threshold(1.0, gamma, horizon)
 
     def losses(self, net, batch, limit):
         config, a = self.config, batch.actions
         s, s_next = (self.network_input(x, limit) for x in (batch.observations, batch.next_observations))
-        mask = 1 - batch.terminals  # bootstrap through time limits, stop where the robot fell
 
         q_cost = net.target_cost_critics(s, a).amax(0)  # (B, 1)
         cost = self.episode_cost(q_cost)
         cost_target = L.td_target(
-            batch.costs[:, None], config.gamma, net.cost_value(s_next), mask[:, None]
+            batch.costs[:, None], config.gamma, net.cost_value(s_next), self.cost_mask(batch)[:, None]
         )  # eq. 16
         if config.recorded_step:
             cost = torch.maximum(cost, self.episode_cost(cost_target.detach()))
