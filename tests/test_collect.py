@@ -295,7 +295,7 @@ def test_ppo_is_saved_and_loaded_whole(tmp_path):
 
     model, other = make(0), make(7)
     model.learn(SLICE)
-    collecting._save_ppo(model, tmp_path / "state.safetensors", 12.5)
+    collecting._save_ppo(model, tmp_path / "state.safetensors", 12.5, {})
     collecting._load_ppo(other, tmp_path / "state.safetensors")
     observations = np.random.default_rng(0).normal(size=(5, 9)).astype(np.float32)
     chosen = [m.predict(observations, deterministic=True)[0] for m in (model, other)]
@@ -311,7 +311,7 @@ def test_ppo_is_saved_and_loaded_whole(tmp_path):
     np.testing.assert_array_equal(*(m.env.normalize_reward(np.ones(3)) for m in (model, other)))
     assert other.num_timesteps == model.num_timesteps == SLICE
     other.learn(SLICE, reset_num_timesteps=False)  # it can go on
-    collecting._save_ppo(other, tmp_path / "state.safetensors", 2.5)
+    collecting._save_ppo(other, tmp_path / "state.safetensors", 2.5, {})
     again = load_file(tmp_path / "state.safetensors")
     assert (again["seconds"], again["steps"]) == (15.0, 2 * SLICE)
 

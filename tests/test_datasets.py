@@ -353,7 +353,29 @@ def test_a_killed_write_leaves_the_old_file(tmp_path, dataset, moment, monkeypat
     assert os.WTERMSIG(os.waitpid(child, 0)[1]) == signal.SIGKILL
     assert path.read_bytes() == before
     write_dataset(path, changed, "CarRun")  # what the killed one left is not in the way
-    assert len(read_dataset(path, "CarRun")) == LENGTHS[0] and os.listdir(tmp_path) == ["a.hdf5"]
+    assert len(read_dataset(path, "CarRun")) == LENGTHS[0]
+    assert [name for name in os.listdir(tmp_path) if not name.startswith(".")] == ["a.hdf5"]
+
+
+def test_another_tasks_file_is_refused_also_where_its_shapes_fit(tmp_path, arrays, dataset):
+    """BallRun and CarRun look alike, and DSRL's files do not say what they are of."""
+    theirs = write_dataset(tmp_path / "mine.hdf5", dataset, "CarRun")
+    with pytest.raises(DatasetError, match="attribute task: CarRun, not BallRun"):
+        write_dataset(tmp_path / "other.hdf5", read_dataset(theirs, "CarRun"), "BallRun")
+    with h5py.File(theirs, "r+") as file:
+        del file.attrs["task"]
+    assert len(read_dataset(theirs, "BallRun")) == len(dataset)  # nothing tells: all episodes are short
+    named = theirs.rename(tmp_path / TASKS["CarRun"].dsrl_file)
+    with pytest.raises(DatasetError, match="its name: CarRun, not BallRun"):
+        read_dataset(named, "BallRun")
+    with h5py.File(theirs, "w") as file:
+        for key in datasets.KEYS:
+            width = {"observations": (7,), "next_observations": (7,), "actions": (2,)}.get(key, ())
+            file[key] = np.zeros((200, *width), np.float32)
+        file["timeouts"][-1] = 1
+    assert len(read_dataset(theirs, "CarRun")) == 200
+    with pytest.raises(DatasetError, match="an episode of 200 steps, but BallRun has 100"):
+        read_dataset(theirs, "BallRun")
 
 
 # --- Where datasets are ---

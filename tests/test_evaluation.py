@@ -116,7 +116,9 @@ def test_an_agent_without_conditions_is_given_none_and_keeps_its_own_threshold()
     agent = make_agent("CIQL", threshold=30.0)
     played = rollout(agent, 30, [1, 2])
     assert np.isnan(played.conditions).all() and np.isnan(played.predicted_costs).all()
-    assert set(evaluate(agent, (50, 70), episodes=2)["threshold"]) == {30.0}
+    assert set(evaluate(agent, episodes=2)["threshold"]) == {30.0}
+    with pytest.raises(ValueError, match="trained for the limit 30, and can be told no other"):
+        evaluate(agent, (50, 70), episodes=2)
     assert np.isfinite(rollout(make_agent("C2IQL w/o CC", threshold=30.0), 30, [1]).predicted_costs).all()
 
 

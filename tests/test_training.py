@@ -372,21 +372,20 @@ def test_an_untouched_copy_is_an_agent(agent_file, tmp_path):
     assert load_agent(tmp_path / "copy.safetensors").seeds == (0, 1)
 
 
-def test_a_write_that_fails_leaves_the_old_file(dataset, tmp_path, monkeypatch):
+def test_a_write_for_which_there_is_no_room_leaves_the_old_file(dataset, tmp_path):
+    resource = pytest.importorskip("resource", reason="limits the size of files")
     agent, path = make_agent(), tmp_path / "agent.safetensors"
     save_agent(agent, path)
-    before, write = path.read_bytes(), training.save_file
-
-    def disk_full(tensors, path, **options):
-        write(tensors, path, **options)
-        os.truncate(path, 100)
-        raise OSError("No space left on device")
-
-    monkeypatch.setattr(training, "save_file", disk_full)
+    before = path.read_bytes()
     train(agent, dataset, steps=1, progress=False)
-    with pytest.raises(OSError, match="space"):
-        save_agent(agent, path)
-    assert path.read_bytes() == before
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (len(before) // 2, limits[1]))
+        with pytest.raises(OSError, match=f"{path}"):
+            save_agent(agent, path)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert path.read_bytes() == before and list(tmp_path.iterdir()) == [path]
 
 
 def test_no_file_of_a_run_is_a_pickle(dataset, tmp_path):

@@ -9,7 +9,7 @@ is kept, as DSRL does, so that the data holds beginners and experts; a grid over
 thins it. Neither price nor allowance is stored: the data looks like logs of many unknown policies.
 """
 
-import os
+import json
 import time
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
@@ -19,12 +19,14 @@ import gymnasium
 import joblib
 import numpy as np
 import torch
+from safetensors import safe_open
 from safetensors.numpy import load_file, save_file
 from scipy.spatial.transform import Rotation
 from tqdm.auto import tqdm
 
 from tutorial_lib.datasets import Dataset, write_dataset
 from tutorial_lib.envs import make_env
+from tutorial_lib.files import written_whole
 from tutorial_lib.tasks import Task
 
 FIELDS = ("observations", "next_observations", "actions", "rewards", "costs", "terminals", "timeouts")
@@ -150,10 +152,20 @@ def along_own_axes(observation: np.ndarray) -> np.ndarray:
 
 
 def run_ppo(task: Task, recipe: Recipe, seed: int, folder: Path, slice_steps: int = 100_000) -> None:
-    """One PPO run; every slice of it, once done, is on disk, and a killed run goes on from there."""
+    """One PPO run; every slice of it, once done, is on disk, and a killed run goes on from there.
+
+    Raises ValueError for a folder in which another recipe was begun.
+    """
     torch.set_num_threads(1)
     folder.mkdir(parents=True, exist_ok=True)
     done = len(list(folder.glob("episodes-*.safetensors")))
+    made_with = {"recipe": _how_to_play(recipe)}
+    if done:
+        with safe_open(folder / "state.safetensors", "np") as file:
+            if file.metadata() != made_with:
+                raise ValueError(
+                    f"{folder}: was begun with another recipe: choose another folder with --runs"
+                )
     slices = -(-recipe.steps // slice_steps)
     if done == slices:
         return
@@ -179,10 +191,17 @@ def run_ppo(task: Task, recipe: Recipe, seed: int, folder: Path, slice_steps: in
         model.learn(goal - model.num_timesteps, reset_num_timesteps=False)
         arrays = {name: np.concatenate([e[name] for e in episodes]) for name in FIELDS}
         episodes.clear()
-        _save_ppo(model, folder / "state.safetensors", time.perf_counter() - started)
+        _save_ppo(model, folder / "state.safetensors", time.perf_counter() - started, made_with)
         _save(arrays, folder / f"episodes-{index:03d}.safetensors")
         bar.update(slice_steps)
     bar.close()
+
+
+def _how_to_play(recipe: Recipe) -> str:
+    """The recipe without what only thinning looks at, as text."""
+    played = asdict(recipe)
+    del played["episodes"], played["return_cells"]
+    return json.dumps(played)
 
 
 def collect(
@@ -234,8 +253,10 @@ def thin(
     of cost, and these into cells of return; every column keeps at most k episodes, with the smallest k that
     gives n in all, and fills them from its cells in turn: no cost and no skill drowns the others. Within a
     cell, episodes on the frontier (none earns as much at as low a cost) come first, the cheapest before the
-    others, then chance.
+    others, then chance. Raises ValueError for n < 1.
     """
+    if n < 1:
+        raise ValueError(f"a dataset keeps at least one episode, not {n}")
     rng = np.random.default_rng(seed)
     within = rng.permutation(np.flatnonzero((costs <= max_cost) & (returns <= max_return)))
     frontier = _on_frontier(costs[within], returns[within])
@@ -298,7 +319,7 @@ def _make_ppo(task: Task, recipe: Recipe, seed: int, episodes: list[dict], clock
     )
 
 
-def _save_ppo(model, path: Path, seconds: float) -> None:
+def _save_ppo(model, path: Path, seconds: float, metadata: dict[str, str]) -> None:
     """PPO's weights, Adam's moments, the running normalisation and the clock; plain arrays, no pickle."""
     arrays = {f"policy.{key}": value.numpy() for key, value in model.policy.state_dict().items()}
     for index, moments in model.policy.optimizer.state_dict()["state"].items():
@@ -308,7 +329,7 @@ def _save_ppo(model, path: Path, seconds: float) -> None:
         arrays |= {f"{name}.{key}": np.asarray(getattr(rms, key)) for key in ("mean", "var", "count")}
     before = float(load_file(path)["seconds"]) if path.exists() else 0.0
     clock = {"steps": np.asarray(model.num_timesteps), "seconds": np.asarray(before + seconds)}
-    _save(arrays | clock, path)
+    _save(arrays | clock, path, metadata)
 
 
 def _load_ppo(model, path: Path) -> None:
@@ -329,8 +350,6 @@ def _load_ppo(model, path: Path) -> None:
     model.num_timesteps = int(arrays["steps"])
 
 
-def _save(arrays: dict[str, np.ndarray], path: Path) -> None:
-    """Write a safetensors file whole or not at all."""
-    temporary = path.with_suffix(".tmp")
-    save_file({key: np.asarray(value, order="C") for key, value in arrays.items()}, temporary)
-    os.replace(temporary, path)
+def _save(arrays: dict[str, np.ndarray], path: Path, metadata: dict[str, str] | None = None) -> None:
+    with written_whole(path) as temporary:
+        save_file({k: np.asarray(value, order="C") for k, value in arrays.items()}, temporary, metadata)

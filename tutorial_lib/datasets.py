@@ -19,6 +19,7 @@ import h5py
 import numpy as np
 import torch
 
+from tutorial_lib.files import written_whole
 from tutorial_lib.tasks import TASKS, Task, get_task
 
 KEYS = ("observations", "next_observations", "actions", "rewards", "costs", "terminals", "timeouts")
@@ -147,16 +148,14 @@ def read_dataset(path: Path | str, task: Task | str) -> Dataset:
     """Read and check a file in DSRL's layout. Columns may be (N, 1). Whatever it holds besides is ignored.
 
     An unfinished tail belongs to no episode: it is dropped, with a warning that counts it. Raises
-    DatasetError for a file that is missing, empty, truncated or not HDF5; for keys that are missing or of
-    the wrong shape for the task; for values that are NaN or infinite, flags that are not 0 or 1, and
-    negative costs; and where no episode ends.
+    DatasetError for a file that is missing, empty, truncated, not HDF5 or another task's; for keys that are
+    missing or of the wrong shape for the task; for episodes longer than its horizon; for values that are
+    NaN or infinite, flags that are not 0 or 1, and negative costs; and where no episode ends.
     """
     path, task = Path(path), _as_task(task)
     stored, attributes = _read_hdf5(path)
     arrays = _check_arrays(stored, task, path)
-    made_for = str(attributes.get("task", task.name))
-    if made_for in TASKS and made_for != task.name:  # BallRun and CarRun have the same shapes
-        raise DatasetError(f"{path}: attribute task: {made_for}, not {task.name}: take another task or file")
+    _check_task(attributes, task, path)
     rows = len(arrays["rewards"])
     ends = np.flatnonzero(arrays["terminals"] | arrays["timeouts"]) + 1
     if not len(ends):
@@ -167,7 +166,12 @@ def read_dataset(path: Path | str, task: Task | str) -> Dataset:
     kept = ends[-1]
     if kept < rows:
         warnings.warn(f"{path}: unfinished tail: dropped {rows - kept} of {rows} transitions", stacklevel=2)
-    return Dataset(**{key: values[:kept] for key, values in arrays.items()}, attributes=attributes)
+    dataset = Dataset(**{key: values[:kept] for key, values in arrays.items()}, attributes=attributes)
+    longest = dataset.episode_lengths.max()
+    if longest > task.horizon:
+        what = f"an episode of {longest} steps, but {task.name} has {task.horizon}"
+        raise DatasetError(f"{path}: timeouts: {what}: is it another task's?")
+    return dataset
 
 
 def write_dataset(path: Path | str, dataset: Dataset, task: Task | str, attributes=None) -> Path:
@@ -179,17 +183,12 @@ def write_dataset(path: Path | str, dataset: Dataset, task: Task | str, attribut
     """
     path, task = Path(path), _as_task(task)
     arrays = _check_arrays({key: getattr(dataset, key) for key in KEYS}, task, path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.tmp")
-    try:
-        with h5py.File(temporary, "w") as file:
-            file.attrs.update(dataset.attributes | (attributes or {}) | {"task": task.name})
-            for key, values in arrays.items():
-                chunks = (min(CHUNK_ROWS, len(values)),) + (1,) * (values.ndim - 1)
-                file.create_dataset(key, data=values, chunks=chunks, **STORAGE)
-        _put_in_place(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    _check_task(dataset.attributes, task, path)
+    with written_whole(path) as temporary, h5py.File(temporary, "w") as file:
+        file.attrs.update(dataset.attributes | (attributes or {}) | {"task": task.name})
+        for key, values in arrays.items():
+            chunks = (min(CHUNK_ROWS, len(values)),) + (1,) * (values.ndim - 1)
+            file.create_dataset(key, data=values, chunks=chunks, **STORAGE)
     return path
 
 
@@ -213,6 +212,19 @@ def _read_hdf5(path: Path) -> tuple[dict, dict]:
         reason = " ".join(str(error).split())
         raise DatasetError(f"{path}: {key}: truncated or damaged: {again} ({reason})") from error
     return arrays, attributes
+
+
+def _check_task(attributes: dict, task: Task, path: Path) -> None:
+    """DatasetError where the file is another task's by its attribute or, DSRL's having none, by its name."""
+    of_names = {
+        other.dsrl_file: other.name for other in TASKS.values()
+    }  # BallRun and CarRun have like shapes
+    for what, made_for in (
+        ("attribute task", str(attributes.get("task", task.name))),
+        ("its name", of_names.get(path.name, task.name)),
+    ):
+        if made_for in TASKS and made_for != task.name:
+            raise DatasetError(f"{path}: {what}: {made_for}, not {task.name}: take another task or file")
 
 
 def _check_arrays(stored: dict, task: Task, path: Path) -> dict[str, np.ndarray]:
@@ -257,13 +269,6 @@ def _check_values(values: np.ndarray, key: str, path: Path) -> np.ndarray:
     if key == "costs":
         refuse(values < 0, "negative cost", "make costs 0 or more")
     return values
-
-
-def _put_in_place(temporary: Path, path: Path):
-    """Replace `path` by a finished file at once: whoever looks finds the old one or the new one, whole."""
-    with open(temporary, "rb+") as file:
-        os.fsync(file.fileno())
-    os.replace(temporary, path)
 
 
 def _as_task(task: Task | str) -> Task:
@@ -331,11 +336,16 @@ def fetch_dataset(task: Task | str, directory: Path | str | None = None, base_ur
                 digest = _verify(found, memory, task)
             except DatasetError as error:
                 raise DatasetError(f"{path}: what {base_url} sent is wrong, and not kept: {error}") from None
-            _put_in_place(found, path)
+            with written_whole(path) as temporary:
+                os.replace(found, temporary)
+        with written_whole(memory) as temporary:
+            temporary.write_text(f"{digest}  {path.name}\n")
+    except OSError as error:
+        raise DatasetError(
+            f"{path.parent}: {error.strerror or error}: make room, or choose another folder"
+        ) from error
     finally:
         shutil.rmtree(partial, ignore_errors=True)
-    if not memory.exists():
-        memory.write_text(f"{digest}  {path.name}\n")
     print(f"{path}: {path.stat().st_size:,} bytes, SHA-256 {digest}")
     return path
 
@@ -344,7 +354,7 @@ def _verify(file: Path, memory: Path, task: Task) -> str:
     """The SHA-256 of a file that is as remembered, if it is remembered, and readable as the task's."""
     with open(file, "rb") as content:
         digest = hashlib.file_digest(content, "sha256").hexdigest()
-    remembered = memory.read_text().split()[0] if memory.exists() else digest
+    remembered = next(iter(memory.read_text().split()), digest) if memory.exists() else digest
     if digest != remembered:
         remedy = f"delete it to fetch it again, or delete {memory.name} to accept it"
         raise DatasetError(f"{file}: SHA-256 is {digest}, but was {remembered} when first fetched: {remedy}")

@@ -13,6 +13,7 @@ from scipy import stats
 from tutorial_lib.algorithms import Agent
 from tutorial_lib.conditioning import check_threshold, nearest_threshold, rescaled_budget
 from tutorial_lib.envs import make_env
+from tutorial_lib.files import written_whole
 from tutorial_lib.tasks import Task, get_task
 
 EPISODES_TOGETHER = 10
@@ -86,11 +87,15 @@ def evaluate(agent: Agent, thresholds=None, episodes: int = 10, workers: int = 1
     """Raw results: one row per run, threshold and episode, by default under the task's three thresholds.
 
     The episodes of a seed start alike under every threshold. More workers give the same rows, sooner.
-    `seeds`: only these of the agent's runs.
+    `seeds`: only these of the agent's runs. Raises ValueError for a limit that the agent was not trained
+    for and cannot be told.
     """
-    thresholds = agent.task.thresholds if thresholds is None else thresholds
-    if agent.threshold is not None:
-        thresholds = [agent.threshold]
+    own = agent.task.thresholds if agent.threshold is None else [agent.threshold]
+    thresholds = own if thresholds is None else thresholds
+    if agent.threshold is not None and set(thresholds) != set(own):
+        raise ValueError(
+            f"{agent.name} was trained for the limit {agent.threshold:g}, and can be told no other"
+        )
     jobs = [
         (run, threshold, range(first, min(first + EPISODES_TOGETHER, episodes)))
         for run, seed in enumerate(agent.seeds)
@@ -103,11 +108,12 @@ def evaluate(agent: Agent, thresholds=None, episodes: int = 10, workers: int = 1
 
 
 def _evaluate_job(agent: Agent, run: int, threshold: float, episodes: range) -> pd.DataFrame:
-    threads = torch.get_num_threads()
+    seed, threads = agent.seeds[run], torch.get_num_threads()
     torch.set_num_threads(1)  # small products: more threads are slower, and the workers are the cores
-    seed = agent.seeds[run]
-    played = rollout(agent, threshold, [1000 * (seed + 1) + episode for episode in episodes], run)
-    torch.set_num_threads(threads)
+    try:
+        played = rollout(agent, threshold, [1000 * (seed + 1) + episode for episode in episodes], run)
+    finally:
+        torch.set_num_threads(threads)
     return pd.DataFrame(
         {
             "task": agent.task.name,
@@ -179,7 +185,5 @@ def _interval(values: np.ndarray) -> tuple[float, float]:
 
 def save_results(results: pd.DataFrame, path: Path) -> None:
     """Write raw results as CSV, whole or not at all."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_suffix(".tmp")
-    results.to_csv(temporary, index=False, float_format="%.6g")
-    temporary.replace(path)
+    with written_whole(path) as temporary:
+        results.to_csv(temporary, index=False, float_format="%.6g")

@@ -1,12 +1,11 @@
 """The training loop: sample, update, log, checkpoint, resume. It knows algorithms only by their interface."""
 
 import csv
+import dataclasses
 import json
-import os
 import time
 import warnings
 from collections.abc import Callable
-from dataclasses import asdict
 from pathlib import Path
 
 import torch
@@ -17,6 +16,7 @@ from tqdm.auto import tqdm
 from tutorial_lib.algorithms import Agent, get_algorithm
 from tutorial_lib.config import Config
 from tutorial_lib.datasets import Batch, Dataset, sample_batch
+from tutorial_lib.files import written_whole
 from tutorial_lib.products import Precision, products
 from tutorial_lib.tasks import get_task
 
@@ -52,6 +52,8 @@ def train(
     agent.data_checksum = dataset.checksum
     log = _resume(agent, generators, run_dir) if run_dir and (run_dir / CHECKPOINT).exists() else []
     dataset = agent.select_episodes(dataset)
+    if agent.config.shift_rewards:
+        dataset = dataclasses.replace(dataset, rewards=dataset.rewards - dataset.rewards.min())
     with products(precision):
         if not agent.updates:
             agent.prepare(dataset, progress)
@@ -100,10 +102,7 @@ def _warn_of_negative_q(agent: Agent, log: list[dict]) -> None:
 def _training_data(dataset: Dataset, agent: Agent) -> Batch:
     data = dataset.tensors(agent.device)
     # A Gaussian policy with a tanh mean cannot reach an action of exactly one: IQL clips a hair inside.
-    data = data._replace(actions=data.actions.clamp(-1 + 1e-5, 1 - 1e-5))
-    if agent.config.shift_rewards:
-        data = data._replace(rewards=data.rewards - data.rewards.min())
-    return data
+    return data._replace(actions=data.actions.clamp(-1 + 1e-5, 1 - 1e-5))
 
 
 def _rows(agent: Agent, scalars: dict[str, torch.Tensor], speed: float) -> list[dict]:
@@ -147,15 +146,13 @@ def _save(agent: Agent, path: Path, tensors: dict[str, torch.Tensor]) -> None:
     header = {
         "task": agent.task.name,
         "algorithm": agent.name,
-        "config": json.dumps(asdict(agent.config)),
+        "config": json.dumps(dataclasses.asdict(agent.config)),
         "seeds": json.dumps(agent.seeds),
         "threshold": json.dumps(agent.threshold),
         "data": json.dumps(agent.data_checksum),
     }
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_suffix(".tmp")
-    save_file({key: value.cpu().contiguous() for key, value in tensors.items()}, temporary, metadata=header)
-    os.replace(temporary, path)
+    with written_whole(path) as temporary:
+        save_file({k: value.cpu().contiguous() for k, value in tensors.items()}, temporary, metadata=header)
 
 
 def load_agent(path: Path | str, device="cpu") -> Agent:
@@ -187,13 +184,10 @@ def load_agent(path: Path | str, device="cpu") -> Agent:
 def save_checkpoint(agent: Agent, generators: list[torch.Generator], log: list[dict], run_dir: Path) -> None:
     """metrics.csv first, then the checkpoint that vouches for it: a kill in between loses nothing."""
     states = {f"generator.{run}": generator.get_state() for run, generator in enumerate(generators)}
-    run_dir.mkdir(parents=True, exist_ok=True)
-    temporary = run_dir / "metrics.tmp"
-    with open(temporary, "w", newline="") as file:
+    with written_whole(run_dir / METRICS) as temporary, open(temporary, "w", newline="") as file:
         writer = csv.DictWriter(file, fieldnames=list(log[0]) if log else ["update"])
         writer.writeheader()
         writer.writerows(log)
-    os.replace(temporary, run_dir / METRICS)
     _save(agent, run_dir / CHECKPOINT, agent.state() | states)
 
 
