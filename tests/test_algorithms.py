@@ -474,6 +474,33 @@ def test_shifted_rewards_start_at_zero():
     assert [row["critic_loss"] for row in logs[0]] == pytest.approx([row["critic_loss"] for row in logs[1]])
 
 
+@pytest.mark.parametrize("shift", [False, True])
+def test_a_price_is_in_mean_returns_of_the_rewards_that_are_trained_on(shift):
+    data, agent = toy_dataset(), make_agent("C2IQL", shift_rewards=shift)
+    train(agent, data, steps=1, progress=False)
+    rewards = (data.rewards - shift * data.rewards.min()).reshape(-1, T).tolist()
+    to_go = [sum(r * 0.8**k for k, r in enumerate(row[t:])) for row in rewards for t in range(T)]
+    assert agent.reward_scale.item() == pytest.approx(abs(sum(to_go) / len(to_go)), rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("name", "gammas"), [("CIQL", [0.8]), ("C2IQL w/o CR", [0.8]), ("C2IQL", TASK.gammas)]
+)
+def test_cost_heads_start_at_the_datas_rate_for_ever(name, gammas):
+    data, agent = toy_dataset(), make_agent(name, hidden_layers=0)
+    agent.prepare(data, progress=False)
+    for place, network in (
+        (agent.parameters, "cost_value"),
+        (agent.parameters, "cost_critics"),
+        (agent.target_parameters, "cost_critics"),
+    ):
+        biases = {key: value[0] * ("bias" in key) for key, value in place[network].items()}
+        inputs = torch.ones(1, TASK.obs_dim + agent.conditioned), torch.ones(1, TASK.act_dim)
+        found = functional_call(agent.modules[network], biases, inputs[: 1 + ("critics" in network)])
+        for heads in found.reshape(-1, len(gammas)).tolist():
+            assert heads == pytest.approx([data.costs.mean() / (1 - gamma) for gamma in gammas], rel=1e-5)
+
+
 # --- A CMDP small enough to solve ---
 
 STATES, ACTIONS = 3, 3

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import inspect
 import re
 import subprocess
 import sys
@@ -89,12 +90,16 @@ def test_help_says_what_a_command_does(command, phrases, c2iql):
 
 def test_every_command_has_help_for_each_of_its_arguments(c2iql):
     overview = words(c2iql("--help")[1])
-    for command in re.search(r"\{([\w,]+)\}", overview).group(1).split(","):
-        status, out, _ = c2iql(command, "--help")
-        assert status == 0
-        for argument in re.findall(r"^│ (--[\w-]+|[A-Z]+) ", out, flags=re.MULTILINE):
-            text = words(out).split(f" {argument} ")[-1]
-            assert re.search(r"[a-z]{2,} [a-z]{2,}", text.split("(default")[0]), (command, argument)
+    for name in re.search(r"\{([\w,]+)\}", overview).group(1).split(","):
+        command = getattr(cli, name)
+        arguments = inspect.signature(command).parameters
+        said = dict(
+            re.findall(r"^        (\w+): (.+)", inspect.getdoc(command).replace("\n    ", "\n        "), re.M)
+        )
+        assert list(said) == list(arguments), name
+        shown = words(c2iql(name, "--help")[1])
+        for argument, text in said.items():
+            assert len(text.split()) > 1 and text.split(",")[0] in shown, (name, argument)
 
 
 def test_it_runs_as_a_module():
@@ -125,6 +130,17 @@ def test_it_runs_as_a_module():
         (["train", "BallRun", "--option", "kappa_1=high"], "--option kappa_1=high: the value must be float"),
         (["train", "BallRun", "--option", "time_limits=off"], "must be Literal['rate', 'bootstrap', 'mask']"),
         (["train", "BallRun", "--option", "shift_rewards=maybe"], "the value must be True or False"),
+        (["train", "BallRun", "--option", "kappa_1=1.5"], "kappa_1 is 1.5, and must be between 0 and 1"),
+        (["train", "BallRun", "--option", "gamma=1"], "gamma is 1.0, and must be between 0 and 1"),
+        (["train", "BallRun", "--option", "steps=-5"], "steps is -5, and must be 1 or more"),
+        (["train", "BallRun", "--option", "profile=paper"], "--option profile=paper: write NAME=VALUE"),
+        (["train", "BallRun", "--seeds", "-2"], "seeds [-2]: at least one, each 0 or more"),
+        (["train", "BallRun", "--seeds"], "seeds []: at least one"),
+        (["collect", "BallRun", "--episodes", "0"], "--episodes 0: must be 1 or more"),
+        (["evaluate", "nowhere.safetensors", "--workers", "0"], "--workers 0: must be 1 or more"),
+        (["evaluate", "nowhere.safetensors", "--out", "."], "--out .: is a folder: name a file"),
+        (["study", "ablations", "--workers", "0"], "--workers 0: must be 1 or more"),
+        (["bench", "--rounds", "0"], "--rounds 0: must be 1 or more"),
         (["train", "BallRun", "--algorithm", "CIQL", "--threshold", "-3"], "must be zero or more, not -3.0"),
         (["train", "BallRun", "--algorithm", "CIQL"], "CIQL is trained for one threshold"),
         (["train", "BallRun", "--threshold", "30"], "C2IQL takes no threshold to train"),
@@ -189,8 +205,8 @@ def test_train_and_evaluate(c2iql, data, tmp_path):
     assert (agent.seeds, agent.config.profile, agent.config.kappa_2) == ((0, 3), "small", 0.65)
 
     status, out, _ = c2iql("evaluate", run / "agent.safetensors", "--episodes", 2, "--workers", 1)
-    assert status == 0 and "cost_score" in out and f"{run}/results.csv: 12 episodes" in out
-    results = pd.read_csv(run / "results.csv")
+    assert status == 0 and "cost_score" in out and f"{run}/agent-results.csv: 12 episodes" in out
+    results = pd.read_csv(run / "agent-results.csv")
     assert sorted(set(results["threshold"])) == [30, 50, 70] and set(results["seed"]) == {0, 3}
 
     other = tmp_path / "other.csv"

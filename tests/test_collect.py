@@ -106,6 +106,11 @@ def test_thinning_draws_at_random_within_a_cell_and_alike_every_time():
     assert kept.tolist() != thin(costs, returns, 100, 80, 1_000, seed=2).tolist()
 
 
+def test_to_keep_no_episode_is_refused():
+    with pytest.raises(ValueError, match="at least one episode, not 0"):
+        thin(np.zeros(5), np.zeros(5), 0, 10, 10)
+
+
 def test_the_bounds_themselves_are_within():
     assert thin(np.array([80.0, 80.5, 10.0]), np.array([5.0, 5.0, 1_000.0]), 9, 80, 1_000).tolist() == [0, 2]
 
@@ -232,10 +237,10 @@ def run_and_die(when, folder):
     """What the killed process does: the first slice, and less than the second."""
     save, steps = collecting._save, []
 
-    def killed_before_the_episodes(arrays, path):
+    def killed_before_the_episodes(arrays, path, *rest):
         if path.name == "episodes-001.safetensors":
             os.kill(os.getpid(), signal.SIGKILL)
-        save(arrays, path)
+        save(arrays, path, *rest)
 
     def killed_in_the_middle(self, action, step=PricedCost.step):
         steps.append(1)
@@ -287,6 +292,29 @@ def test_a_killed_collection_goes_on_and_makes_a_dataset(when, tmp_path, monkeyp
     monkeypatch.setattr(collecting, "_make_ppo", None)  # all is there: nothing is run again
     collecting.collect(BALL, (0,), RECIPE, tmp_path, tmp_path / "again.hdf5", workers=1)
     assert (tmp_path / "again.hdf5").read_bytes() == out.read_bytes()
+    with pytest.raises(ValueError, match=f"{run}: was begun with another recipe"):
+        collecting.collect(BALL, (0,), replace(RECIPE, prices=(5.0, 50.0)), tmp_path, out, workers=1)
+
+
+def test_prices_rise_and_the_learning_rate_falls_along_a_run(tmp_path, monkeypatch):
+    scales, rates, make = [], [], collecting._make_ppo
+
+    def noting(*arguments):
+        model = make(*arguments)
+        train = model.train
+
+        def noted():
+            train()
+            scales.append(model.env.get_attr("price_scale")[0])
+            rates.append(model.policy.optimizer.param_groups[0]["lr"])
+
+        model.train = noted
+        return model
+
+    monkeypatch.setattr(collecting, "_make_ppo", noting)
+    recipe = replace(RECIPE, ramp=(0.25, 0.75), learning_rate=(1e-3, 2e-4), steps=4 * SLICE)
+    run_ppo(BALL, recipe, 0, tmp_path, slice_steps=SLICE)
+    assert scales == pytest.approx([0, 0, 0.5, 1]) and rates == pytest.approx([1e-3, 8e-4, 6e-4, 4e-4])
 
 
 def test_ppo_is_saved_and_loaded_whole(tmp_path):

@@ -75,19 +75,6 @@ def test_the_map_counts_steps_and_hazards():
     ]  # fmt: skip
 
 
-def test_arrows_are_as_long_as_their_probability_and_only_where_the_shade_is():
-    policy = np.full((15, 4), 0.25)
-    policy[10] = 0.5, 0.49, 0.01, 0
-    policy[5] = 0, 1, 0, 0
-    shade = np.zeros(15)
-    shade[[5, 10, 14]] = 1
-    figure = plotting.shortcut_policies({"a": (policy, shade), "b": (policy, shade * 0)})
-    assert [ax.get_title() for ax in figure.axes] == ["a", "b"]
-    found = arrows(figure.axes[0])
-    assert found == {(0, 0): [[0, 0.27], [0.267, 0]], (0, 1): [[0.44, 0]]}  # none on the goal
-    assert arrows(figure.axes[1]) == {}
-
-
 def test_the_frontier_holds_the_limits_own_solution():
     found = tabular.solve(tabular.shortcut(), 1.4)
     figure = widgets.shortcut(1.4)

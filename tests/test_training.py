@@ -11,6 +11,7 @@ import re
 import signal
 import subprocess
 import sys
+import warnings
 import zipfile
 from pathlib import Path
 
@@ -386,6 +387,31 @@ def test_a_write_for_which_there_is_no_room_leaves_the_old_file(dataset, tmp_pat
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert path.read_bytes() == before and list(tmp_path.iterdir()) == [path]
+
+
+def test_actions_at_the_edge_are_moved_a_hair_inside(dataset):
+    """The Gaussian's mean is a tanh: it cannot be one, and the likelihood would pull it there for ever."""
+    edge = dataclasses.replace(dataset, actions=np.sign(dataset.actions))
+    seen = training._training_data(edge, make_agent()).actions
+    assert seen.abs().max() < 1 and seen.numpy() == pytest.approx(edge.actions, abs=1e-4)
+
+
+def test_negative_q_under_the_zero_penalty_is_warned_of(dataset):
+    losing = dataclasses.replace(dataset, rewards=dataset.rewards - 50)
+    options = {"steps": 40, "critic_lr": 0.1, "value_lr": 0.1}
+    with pytest.warns(UserWarning, match="of Q_r are negative: .* shift_rewards=True, or an unsafe_price"):
+        train(make_agent("C2IQL", **options), losing, progress=False)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        train(make_agent("C2IQL", **options, shift_rewards=True), losing, progress=False)
+        train(make_agent("C2IQL", **options, unsafe_price=1.0), losing, progress=False)
+
+
+def test_a_file_of_another_number_of_runs_is_refused(dataset, tmp_path):
+    """Copied, one run would be repeated for all."""
+    three, one = make_agent(seeds=(0, 1, 2)), make_agent()
+    with pytest.raises(ValueError, match="shape"):
+        three.load_state(one.state())
 
 
 def test_no_file_of_a_run_is_a_pickle(dataset, tmp_path):

@@ -66,6 +66,7 @@ def collect(
     """
     from tutorial_lib import collect as collecting  # pulls in stable-baselines3: slow to import
 
+    check_counts(steps=steps, episodes=episodes, workers=workers)
     recipe = collecting.RECIPES[get_task(task).name]
     changes = {"steps": steps, "episodes": episodes}
     recipe = dataclasses.replace(
@@ -132,16 +133,18 @@ def evaluate(
 
     Args:
         agent: an agent.safetensors or a checkpoint.safetensors.
-        out: the CSV to write; default results.csv beside the agent.
-        thresholds: cost limits; default the task's three.
+        out: the CSV to write; default beside the agent, e.g. agent-results.csv.
+        thresholds: cost limits; default the task's three, or the one that the agent was trained for.
         episodes: per seed and threshold.
         workers: processes; the results do not depend on their number.
     """
-    loaded = training.load_agent(agent)
-    results = evaluation.evaluate(loaded, thresholds, episodes, workers)
-    out = out or agent.parent / "results.csv"
-    evaluation.save_results(results, out)
+    check_counts(episodes=episodes, workers=workers)
+    out = out or agent.with_name(f"{agent.stem}-results.csv")
+    if out.is_dir():
+        raise ValueError(f"--out {out}: is a folder: name a file")
+    results = evaluation.evaluate(training.load_agent(agent), thresholds, episodes, workers)
     print(evaluation.summarise(results).round(3).to_string(index=False))
+    evaluation.save_results(results, out)
     print(f"{out}: {len(results)} episodes")
 
 
@@ -178,6 +181,7 @@ def study(
     """
     from tutorial_lib import cells, engine, results  # pulls in dask
 
+    check_counts(workers=workers, steps=steps)
     record, folder = studies.get_study(name), runs / name
     changes = (*option, *(() if steps is None else (f"steps={steps}",)))
     settings = {"change": lambda config: with_options(config, changes), "profile": profile, "data": data}
@@ -228,6 +232,7 @@ def bench(
     from tutorial_lib import bench as benchmarks
 
     record, device = get_task(task), check_device(device)
+    check_counts(workers=workers, rounds=rounds)
     if peers:
         benchmarks.install()
     if full:
@@ -263,19 +268,26 @@ def report(name: Positional[str | None] = None) -> None:
 
 def with_options(config: Config, options: tuple[str, ...]) -> Config:
     """The config with `name=value` changes; values are read as the field's own type. Raises ValueError."""
-    types = {field.name: field.type for field in dataclasses.fields(Config)}
+    types = {field.name: field.type for field in dataclasses.fields(Config) if field.name != "profile"}
     for option in options:
-        name, equals, _ = option.partition("=")
+        name, equals, text = option.partition("=")
         if not equals or name not in types:
             raise ValueError(f"--option {option}: write NAME=VALUE with one of {', '.join(types)}")
-        values = (tyro.conf.FlagConversionOff,)  # shift_rewards=True, not --shift-rewards
         try:
             with contextlib.redirect_stderr(io.StringIO()):  # tyro's message is for another command line
-                config = tyro.cli(Config, default=config, args=[f"--{option}"], config=values)
+                value = tyro.cli(types[name], args=[text])
         except SystemExit:
             kind = "True or False" if types[name] is bool else inspect.formatannotation(types[name])
             raise ValueError(f"--option {option}: the value must be {kind}") from None
+        config = dataclasses.replace(config, **{name: value})
     return config
+
+
+def check_counts(**numbers: int | None) -> None:
+    """ValueError for an argument that must be at least one and is not."""
+    for name, number in numbers.items():
+        if number is not None and number < 1:
+            raise ValueError(f"--{name} {number}: must be 1 or more")
 
 
 def check_device(device: Device) -> Device:

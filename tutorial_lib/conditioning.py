@@ -3,6 +3,8 @@
 import math
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from tutorial_lib.tasks import Task
 
@@ -15,10 +17,10 @@ def threshold_set(task: Task, with_zero: bool = False) -> np.ndarray:
     return np.array([*([0.0] if with_zero else []), *task.thresholds, math.inf])
 
 
-def encode(threshold, task: Task) -> np.ndarray:
+def encode(threshold, task: Task) -> Tensor:
     """Thresholds as network inputs: in units of the task's cost range, so that they are of order one."""
-    threshold = np.asarray(threshold, float)
-    return np.where(np.isinf(threshold), INFINITE_CODE, threshold / task.cost_range).astype(np.float32)
+    threshold = torch.as_tensor(threshold, dtype=torch.float32)
+    return torch.where(threshold.isinf(), INFINITE_CODE, threshold / task.cost_range)
 
 
 def check_threshold(threshold: float) -> float:

@@ -90,6 +90,20 @@ class Config:
     shift_rewards: bool = False
     """Train on rewards minus their dataset minimum. The zero penalty punishes only where Q_r > 0."""
 
+    def __post_init__(self):
+        """Raises ValueError for a number that means nothing where it stands."""
+        for names, holds, words in (
+            ("kappa_1 kappa_2 cost_kappa gamma", lambda x: 0 < x < 1, "between 0 and 1"),
+            ("target_tau", lambda x: 0 < x <= 1, "above 0, and 1 at most"),
+            ("batch_size steps hidden_width crm_width cost_critics", lambda x: x >= 1, "1 or more"),
+            ("value_lr critic_lr policy_lr awr_alpha unsafe_price", lambda x: x >= 0, "0 or more"),
+            ("hidden_layers crm_layers crm_steps crm_noise crm_noise_rate", lambda x: x >= 0, "0 or more"),
+        ):
+            for name in names.split():
+                value = getattr(self, name)
+                if value is not None and not holds(value):
+                    raise ValueError(f"{name} is {value}, and must be {words}")
+
     @property
     def evaluated_kappa(self) -> float:
         """The expectile of the implicit policy whose cost V_c learns."""

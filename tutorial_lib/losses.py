@@ -20,6 +20,7 @@ def awr_weight(advantage: Tensor, alpha: float) -> Tensor:
 
 def expectile_loss(target: Tensor, value: Tensor, kappa: float) -> Tensor:
     """Eqs. 6 and 12: mean of |kappa - 1(u < 0)| u^2 with u = target - value; both (B,)."""
+    assert target.shape == value.shape, (target.shape, value.shape)  # else they broadcast, in silence
     advantage = target.detach() - value
     return (expectile_weight(advantage, kappa).detach() * advantage.square()).mean()
 
@@ -48,14 +49,17 @@ def td_target(reward: Tensor, gamma: Tensor | float, next_value: Tensor, mask: T
 
 def td_loss(target: Tensor, q: Tensor) -> Tensor:
     """Lines 16 and 18: mean squared error of an ensemble, summed over it: target (B, ...), q (k, B, ...)."""
+    assert target.shape == q.shape[1:], (target.shape, q.shape)
     return (target.detach() - q).square().mean(dim=tuple(range(1, q.ndim))).sum()
 
 
 def cost_value_loss(weight: Tensor, q_cost: Tensor, value_cost: Tensor) -> Tensor:
     """Eq. 17: mean of M (Q_c - V_c)^2 with M the weight (B,) of the implicit policy; Q_c and V_c (B, m)."""
+    assert q_cost.shape == value_cost.shape == (*weight.shape, q_cost.shape[-1])
     return (weight.detach().unsqueeze(-1) * (q_cost.detach() - value_cost).square()).mean()
 
 
 def policy_loss(weight: Tensor, log_prob: Tensor) -> Tensor:
     """Eqs. 8 and 18 with the sign of Algorithm 2's line 20: -mean of weight log pi(a | s); both (B,)."""
+    assert weight.shape == log_prob.shape, (weight.shape, log_prob.shape)
     return -(weight.detach() * log_prob).mean()

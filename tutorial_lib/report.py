@@ -14,23 +14,12 @@ from tutorial_lib.datasets import SHIPPED_DATA, load_dataset, shipped_tasks
 from tutorial_lib.evaluation import with_scores
 from tutorial_lib.logs import best_left
 from tutorial_lib.paper import CLAIMS, TABLE1
+from tutorial_lib.plotting import cost_return_plane, speed, study_figure
 from tutorial_lib.results import RESULTS, SCORES, load_results, not_run, options_of, over_seeds, verdicts
 from tutorial_lib.studies import STUDIES, get_study
-from tutorial_lib.tasks import TASKS, get_task
+from tutorial_lib.tasks import DSRL_FRONTIER, TASKS, get_task
 
 ROOT = SHIPPED_DATA.parent
-
-DSRL_FRONTIER = {
-    "BallRun": {0: 440, 20: 450, 50: 900, 80: 1300},
-    "CarRun": {0: 570},
-    "DroneRun": {0: 410, 50: 500, 100: 660},
-    "AntRun": {0: 700, 70: 750, 150: 950},
-    "BallCircle": {0: 600, 30: 700, 60: 880},
-    "CarCircle": {0: 430, 30: 480, 100: 530},
-    "DroneCircle": {0: 680, 40: 780, 90: 990},
-    "AntCircle": {0: 260, 75: 350, 130: 450},
-}
-"""The best returns in DSRL's data at some costs, read off its published plots."""
 
 
 def datasheet() -> str:
@@ -153,8 +142,6 @@ def studies_text() -> str:
 
 def write_study(name: str) -> Path | None:
     """Draw a study's figure beside its results; None where it was not run."""
-    from tutorial_lib.plotting import study_figure
-
     get_study(name)  # raises ValueError where there is none
     results = load_results(name)
     if not len(results):
@@ -187,8 +174,6 @@ def speed_text() -> str:
 
 def write_speed() -> Path | None:
     """Draw the figure of speed beside its files; None where nothing was measured."""
-    from tutorial_lib.plotting import speed
-
     updates, path = tables.load("updates"), tables.FOLDER / "speed.png"
     if updates is None:
         return None
@@ -230,8 +215,6 @@ def pages() -> dict[Path, str]:
 
 def write() -> list[Path]:
     """Bring the pages, the pictures of the datasets and the studies' figures up to date. Returns them all."""
-    from tutorial_lib.plotting import cost_return_plane
-
     figures = [path for path in (*map(write_study, STUDIES), write_speed()) if path]
     written = pages()
     for path, text in written.items():

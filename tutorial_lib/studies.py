@@ -47,7 +47,7 @@ SIZES = ({"crm": "linear"}, {"crm_width": 16, "crm_layers": 1}, {"crm_width": 64
     {"crm_width": 512, "crm_layers": 5},
 )
 ABLATIONS = ("C2IQL", "C2IQL w/o CR", "C2IQL w/o CC", "CIQL")
-PAIR = ("BallRun", "CarCircle")  # the shortest horizon and the longest: gamma^T is 0.01 and 0.05
+PAIR = ("BallRun", "CarCircle")  # a short horizon and a long one: the smallest gamma^T is 0.01 and 0.05
 
 OWN_OPTIONS = {
     "DroneRun": {"time_limits": "mask"},

@@ -73,6 +73,18 @@ TASKS: dict[str, Task] = {
     )
 }
 
+DSRL_FRONTIER = {
+    "BallRun": {0: 440, 20: 450, 50: 900, 80: 1300},
+    "CarRun": {0: 570},
+    "DroneRun": {0: 410, 50: 500, 100: 660},
+    "AntRun": {0: 700, 70: 750, 150: 950},
+    "BallCircle": {0: 600, 30: 700, 60: 880},
+    "CarCircle": {0: 430, 30: 480, 100: 530},
+    "DroneCircle": {0: 680, 40: 780, 90: 990},
+    "AntCircle": {0: 260, 75: 350, 130: 450},
+}
+"""The best returns in DSRL's data at some costs, read off its published plots."""
+
 
 def get_task(name: str) -> Task:
     """The task called `name`; its gymnasium id works too. Raises ValueError with the nearest names."""

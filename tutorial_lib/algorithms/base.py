@@ -57,8 +57,9 @@ class Agent:
             )
             raise ValueError(f"{self.name} {verb}")
         self.task, self.config, self.seeds, self.device = task, config, tuple(seeds), torch.device(device)
+        if not self.seeds or min(self.seeds) < 0:
+            raise ValueError(f"seeds {list(self.seeds)}: at least one, each 0 or more")
         self.threshold = None if threshold is None else check_threshold(threshold)
-        self.gammas = torch.tensor(task.gammas, device=self.device)
 
         self.observation_mean = torch.zeros(task.obs_dim, device=self.device)
         self.observation_std = torch.ones(task.obs_dim, device=self.device)
@@ -235,15 +236,21 @@ class Agent:
     def load_state(self, tensors: dict[str, Tensor]) -> None:
         """The inverse of `state`. Without adam.* and target.* the agent can act, and train on only afresh.
 
-        Raises KeyError for a missing tensor, RuntimeError for one of another shape.
+        Raises KeyError for a missing tensor, ValueError for one of another shape.
         """
+
+        def put(place: Tensor, value: Tensor) -> None:
+            if value.shape != place.shape:  # copy_ would repeat one run for all
+                raise ValueError(f"a tensor of shape {tuple(value.shape)} where {tuple(place.shape)} belongs")
+            place.copy_(value)
+
         with torch.no_grad():
             for name, params in self.parameters.items():
                 for key, value in params.items():
-                    value.copy_(tensors[f"online.{name}.{key}"])
+                    put(value, tensors[f"online.{name}.{key}"])
             for name, params in self.target_parameters.items():
                 for key, value in params.items():
-                    value.copy_(tensors.get(f"target.{name}.{key}", self.parameters[name][key]))
+                    put(value, tensors.get(f"target.{name}.{key}", self.parameters[name][key]))
         state = self.optimiser.state_dict() | {"state": {}}
         for key, value in tensors.items():
             if key.startswith("adam."):

@@ -7,7 +7,7 @@ import torch
 
 from tutorial_lib import losses as L
 from tutorial_lib.algorithms.base import Agent, cost_guess, reward_guess
-from tutorial_lib.conditioning import INFINITE_CODE, threshold_set
+from tutorial_lib.conditioning import encode, threshold_set
 from tutorial_lib.discounting import average_threshold
 from tutorial_lib.networks import Critics, Policy, Value, gaussian_log_prob
 from tutorial_lib.reconstruction import CostReconstruction, train_reconstruction
@@ -61,8 +61,7 @@ class C2IQL(Agent):
         observations = super().network_input(observations, limit)
         if not self.conditioned:
             return observations
-        code = torch.where(limit.isinf(), INFINITE_CODE, limit / self.task.cost_range)
-        return torch.cat([observations, code.unsqueeze(-1)], -1)
+        return torch.cat([observations, encode(limit, self.task).unsqueeze(-1)], -1)
 
     def episode_cost(self, q_cost):
         """Lines 6 to 8: discounted costs (..., m) as the cost of a whole episode, (...,)."""

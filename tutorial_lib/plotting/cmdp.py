@@ -144,20 +144,6 @@ def _cell(place):
 
 
 @one_figure
-def shortcut_policies(panels: dict):
-    """Policies on the map, by title: pairs of a policy (15, 4) and the cells' shade (15,) from 0 to 1.
-
-    Arrows are as long as the action's probability, and left out in cells of shade 0.
-    """
-    figure, axes = subplots(1, len(panels), figsize=(4.3 * len(panels), 3.4), squeeze=False)
-    for ax, (title, (policy, shade)) in zip(axes[0], panels.items(), strict=True):
-        _draw_grid(ax, shade)
-        _draw_policy(ax, policy, np.asarray(shade) > 0)
-        ax.set_title(title)
-    return figure
-
-
-@one_figure
 def shortcut_under_limit(limit: float):
     """The shortcut's Pareto frontier with the limit's place on it; the best policy and where it goes."""
     cost, reward = _frontier()

@@ -16,8 +16,7 @@ from tutorial_lib.plotting.style import (
     subplots,
     task_panels,
 )
-from tutorial_lib.report import DSRL_FRONTIER
-from tutorial_lib.tasks import Task, get_task
+from tutorial_lib.tasks import DSRL_FRONTIER, Task, get_task
 
 DOTS = {"marker": "o", "linestyle": "none", "markersize": 3, "alpha": 0.4, "markeredgewidth": 0}
 

@@ -49,8 +49,10 @@ class Spending(NamedTuple):
 def follow(cmdp: CMDP, horizon: int, policy: Callable[[int], np.ndarray]) -> Spending:
     """Exactly, without simulation: `policy(t)` gives (T+1, S, A), the policy after each sum c already spent.
 
-    Costs must be 0 or 1, as in all of the course's tasks.
+    Costs must be 0 or 1, as in all of the course's tasks: else ValueError.
     """
+    if not np.isin(cmdp.costs, (0, 1)).all():
+        raise ValueError("costs must be 0 or 1")
     states = len(cmdp.initial)
     here = np.zeros((horizon + 1, states))  # P(spent c, in state s)
     here[0] = cmdp.initial
