@@ -116,9 +116,21 @@ def study_table(results: pd.DataFrame) -> pd.DataFrame:
             row[f"{word} limit" if word else f"limit {limit:g}"] = _pair(*scores)
         mean = over_seeds(part, ("task",)).iloc[0]
         for score, word in zip(SCORES, ("reward", "cost"), strict=True):
-            row[word] = f"{mean[score]:.2f} ± {mean[f'{score}_std']:.2f}"
+            spread = "" if row["seeds"] == 1 else f" ± {mean[f'{score}_std']:.2f}"
+            row[word] = f"{mean[score]:.2f}{spread}"
         rows.append(row)
     return pd.DataFrame(rows)
+
+
+def paper_profile_table() -> str:
+    """The run of profile `paper`, by the updates that it had made, and profile `small` on the same data."""
+    paper, small = load_results("paper-profile"), load_results("table1")
+    if not len(paper):
+        return "*Not run.*"
+    same = small["task"].isin(paper["task"]) & (small["algorithm"] == "C2IQL")
+    both = pd.concat([paper.sort_values("updates", kind="stable"), small[same]])
+    words = both["profile"] + ", " + both["updates"].map("{:,} updates".format)
+    return markdown(study_table(both.assign(run=words)))
 
 
 def study_section(name: str) -> str:
@@ -204,6 +216,7 @@ def pages() -> dict[Path, str]:
     data, readme = SHIPPED_DATA / "README.md", ROOT / "README.md"
     text = data.read_text()
     made = {"datasheet": datasheet, "frontier": frontier, "studies": studies_text, "speed": speed_text}
+    made["paper-profile"] = paper_profile_table
     for name, table in made.items():
         text = between_marks(text, name, table())
     front = readme.read_text()
