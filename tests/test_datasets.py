@@ -517,6 +517,14 @@ def test_a_second_fetch_verifies_and_downloads_nothing(server, tmp_path):
     assert path.read_bytes() == server.body + b"!"  # the user's file is the user's
 
 
+def test_a_checksum_that_a_full_disk_cut_short_is_written_anew(server, tmp_path):
+    path = fetch(server, tmp_path)
+    memory = path.with_name(f"{path.name}.sha256")
+    whole = memory.read_text()
+    memory.write_text("")
+    assert fetch(server, tmp_path) == path and server.requests == 1 and memory.read_text() == whole
+
+
 def test_a_server_that_changed_its_file_is_noticed(server, tmp_path, dataset):
     path = fetch(server, tmp_path)
     path.unlink()

@@ -58,7 +58,8 @@ class Config:
     time_limits: Literal["rate", "bootstrap", "mask"] = "rate"
     """What a time limit means to the cost critics. 'rate' bootstraps through it and scales head i by
     1 - gamma_i^T before the reconstruction; 'bootstrap' leaves out the factor; 'mask' stops there, so that
-    the estimate is the remaining cost and is compared with the unscaled remaining budget."""
+    the estimate is the remaining cost and is compared with the unscaled remaining budget. (CPQ bootstraps,
+    as its code does, whatever this says.)"""
     reward_time_limits: Literal["bootstrap", "mask"] = "mask"
     """What a time limit means to V_r and Q_r. 'bootstrap' is IQL's code, 'mask' is OSRL's. States at time
     limits are never trained on, and in the Run tasks nothing like them is: bootstrapping extrapolates."""
