@@ -28,6 +28,7 @@ nb_code_prompt_show = "Show a solution"  # nothing else is hidden
 nb_code_prompt_hide = "Hide it"
 nb_ipywidgets_js = {}  # sliders need a running kernel, and their scripts the network
 myst_enable_extensions = ["dollarmath", "amsmath"]
+myst_heading_anchors = 3  # the pages link to their own sections
 autodoc_member_order = "bysource"
 add_module_names = False  # the page's title says it
 
