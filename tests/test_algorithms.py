@@ -260,6 +260,15 @@ def test_one_run_takes_the_same_step_as_several(name):
         assert value[1:] == pytest.approx(alone[key], rel=1e-4, abs=1e-5), key
 
 
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_an_update_leaves_nothing_behind_but_numbers(name):
+    """A graph that the targets kept would grow with every update: three gigabytes in the paper's 400,000."""
+    agent = make_agent(name)
+    one_update(agent, random_batch(1))
+    for parameters in agent.target_parameters.values():
+        assert not any(value.requires_grad for value in parameters.values())
+
+
 # --- What each loss reaches ---
 
 

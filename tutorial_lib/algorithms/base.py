@@ -193,10 +193,11 @@ class Agent:
             group["lr"] = group["base_lr"]
         self.optimiser.param_groups[list(self.parameters).index("policy")]["lr"] *= self._cosine()
         self.optimiser.step()
-        for name, averages in self.target_parameters.items():
-            torch._foreach_lerp_(
-                list(averages.values()), list(self.parameters[name].values()), self.config.target_tau
-            )
+        with torch.no_grad():  # or the targets would remember how they came about, for ever
+            for name, averages in self.target_parameters.items():
+                torch._foreach_lerp_(
+                    list(averages.values()), list(self.parameters[name].values()), self.config.target_tau
+                )
         self.updates += 1
         return scalars
 
