@@ -338,8 +338,9 @@ def fetch_dataset(task: Task | str, directory: Path | str | None = None, base_ur
                 raise DatasetError(f"{path}: what {base_url} sent is wrong, and not kept: {error}") from None
             with written_whole(path) as temporary:
                 os.replace(found, temporary)
-        with written_whole(memory) as temporary:
-            temporary.write_text(f"{digest}  {path.name}\n")
+        if not _remembered(memory):
+            with written_whole(memory) as temporary:
+                temporary.write_text(f"{digest}  {path.name}\n")
     except OSError as error:
         raise DatasetError(
             f"{path.parent}: {error.strerror or error}: make room, or choose another folder"
@@ -354,12 +355,17 @@ def _verify(file: Path, memory: Path, task: Task) -> str:
     """The SHA-256 of a file that is as remembered, if it is remembered, and readable as the task's."""
     with open(file, "rb") as content:
         digest = hashlib.file_digest(content, "sha256").hexdigest()
-    remembered = next(iter(memory.read_text().split()), digest) if memory.exists() else digest
+    remembered = _remembered(memory) or digest
     if digest != remembered:
         remedy = f"delete it to fetch it again, or delete {memory.name} to accept it"
         raise DatasetError(f"{file}: SHA-256 is {digest}, but was {remembered} when first fetched: {remedy}")
     read_dataset(file, task)
     return digest
+
+
+def _remembered(memory: Path) -> str | None:
+    """The SHA-256 in a `.sha256` file; None where there is none, or a full disk cut it short."""
+    return next(iter(memory.read_text().split()), None) if memory.exists() else None
 
 
 def _download(base_url: str, name: str, folder: Path) -> Path:

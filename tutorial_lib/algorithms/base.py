@@ -137,17 +137,11 @@ class Agent:
 
     def reward_mask(self, batch: Batch) -> Tensor:
         """1 where Q_r bootstraps, 0 where nothing follows, (B,)."""
-        ends = batch.terminals
-        if self.config.reward_time_limits == "mask":
-            ends = torch.maximum(ends, batch.timeouts)
-        return 1 - ends
+        return _goes_on(batch, self.config.reward_time_limits)
 
     def cost_mask(self, batch: Batch) -> Tensor:
         """1 where Q_c bootstraps, 0 where nothing follows, (B,)."""
-        ends = batch.terminals
-        if self.config.time_limits == "mask":
-            ends = torch.maximum(ends, batch.timeouts)
-        return 1 - ends
+        return _goes_on(batch, self.config.time_limits)
 
     def guess_costs(self, dataset: Dataset) -> None:
         """All cost heads start at the dataset's own cost rate.
@@ -288,6 +282,10 @@ class Agent:
 
     def _tensor(self, x) -> Tensor:
         return torch.as_tensor(np.asarray(x, np.float32), device=self.device)
+
+
+def _goes_on(batch: Batch, time_limits: str) -> Tensor:
+    return 1 - (torch.maximum(batch.terminals, batch.timeouts) if time_limits == "mask" else batch.terminals)
 
 
 def reward_guess(task: Task, config: Config) -> float:
