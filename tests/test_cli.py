@@ -93,9 +93,7 @@ def test_every_command_has_help_for_each_of_its_arguments(c2iql):
     for name in re.search(r"\{([\w,]+)\}", overview).group(1).split(","):
         command = getattr(cli, name)
         arguments = inspect.signature(command).parameters
-        said = dict(
-            re.findall(r"^        (\w+): (.+)", inspect.getdoc(command).replace("\n    ", "\n        "), re.M)
-        )
+        said = dict(re.findall(r"^    (\w+): (.+)", inspect.getdoc(command), re.M))
         assert list(said) == list(arguments), name
         shown = words(c2iql(name, "--help")[1])
         for argument, text in said.items():

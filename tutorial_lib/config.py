@@ -97,9 +97,12 @@ class Config:
             ("kappa_1 kappa_2 cost_kappa gamma", lambda x: 0 < x < 1, "between 0 and 1"),
             ("target_tau", lambda x: 0 < x <= 1, "above 0, and 1 at most"),
             ("batch_size steps hidden_width cost_critics", lambda x: x >= 1, "1 or more"),
-            ("value_lr critic_lr policy_lr awr_alpha unsafe_price", lambda x: x >= 0, "0 or more"),
-            ("hidden_layers crm_width crm_layers crm_steps", lambda x: x >= 0, "0 or more"),
-            ("crm_noise crm_noise_rate", lambda x: x >= 0, "0 or more"),
+            (
+                "value_lr critic_lr policy_lr awr_alpha unsafe_price hidden_layers "
+                "crm_width crm_layers crm_steps crm_noise crm_noise_rate",
+                lambda x: x >= 0,
+                "0 or more",
+            ),
         ):
             for name in names.split():
                 value = getattr(self, name)

@@ -216,9 +216,8 @@ def _read_hdf5(path: Path) -> tuple[dict, dict]:
 
 def _check_task(attributes: dict, task: Task, path: Path) -> None:
     """DatasetError where the file is another task's by its attribute or, DSRL's having none, by its name."""
-    of_names = {
-        other.dsrl_file: other.name for other in TASKS.values()
-    }  # BallRun and CarRun have like shapes
+    # BallRun and CarRun have the same shapes.
+    of_names = {other.dsrl_file: other.name for other in TASKS.values()}
     for what, made_for in (
         ("attribute task", str(attributes.get("task", task.name))),
         ("its name", of_names.get(path.name, task.name)),
