@@ -13,6 +13,7 @@ from tutorial_lib.plotting.style import (
     legend_below,
     one_figure,
     subplots,
+    task_panels,
 )
 
 FALSE_POSITIVE, FALSE_NEGATIVE = "safe, but rejected", "unsafe, but accepted"
@@ -93,18 +94,14 @@ def falling_cost(gamma: float, start: int, horizon: int = 301, limit: float = 50
 
 
 @one_figure
-def mismatch(panels, ylabel: str = r"discounted cost $\tilde C$", columns: int = 4):
+def mismatch(panels, ylabel: str = r"discounted cost $\tilde C$"):
     """Fig. 1: a dot per sequence, its cost and an estimate of it; what the estimate misjudges stands out.
 
     `panels` maps a title to (costs (n,), estimates (n,), limit of the costs, limit of the estimates).
     """
-    columns = min(columns, len(panels))
-    lines = -(-len(panels) // columns)
-    figure, axes = subplots(lines, columns, figsize=(12, 4.3 * lines + 0.4), squeeze=False)
+    figure, axes = task_panels(panels, 4.6)
     for ax, (title, panel) in zip(axes.flat, panels.items(), strict=False):
         _draw_mismatch(ax, title, *panel)
-    for ax in axes.flat[len(panels) :]:
-        ax.set_visible(False)
     for ax in axes[:, 0]:
         ax.set_ylabel(ylabel)
     legend_below(figure, axes[0, 0])
@@ -138,18 +135,14 @@ def misjudged_shares(counts):
     `counts` maps a task to {limit: (false positives, false negatives)} as shares; blue bars hang, vermilion
     ones stand.
     """
-    columns = min(4, len(counts))
-    lines = -(-len(counts) // columns)
-    figure, axes = subplots(lines, columns, figsize=(12, 3.6 * lines + 0.6), sharey=True, squeeze=False)
-    for ax, (task, limits) in zip(axes.flat, counts.items(), strict=False):
+    figure, axes = task_panels(counts, 3.9, sharey=True)
+    for ax, limits in zip(axes.flat, counts.values(), strict=False):
         x = np.arange(len(limits))
         positives, negatives = 100 * np.array(list(limits.values())).T
         ax.bar(x - 0.2, positives, 0.38, color=COLOURS[FALSE_POSITIVE], label=FALSE_POSITIVE)
         ax.bar(x + 0.2, negatives, 0.38, color=COLOURS[FALSE_NEGATIVE], label=FALSE_NEGATIVE)
         ax.set_xticks(x, [f"{limit:g}" for limit in limits])
-        ax.set(title=task, xlabel="limit $L$")
-    for ax in axes.flat[len(counts) :]:
-        ax.set_visible(False)
+        ax.set(xlabel="limit $L$")
     for ax in axes[:, 0]:
         ax.set_ylabel("% of the episodes")
     legend_below(figure, axes[0, 0])
