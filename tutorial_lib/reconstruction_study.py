@@ -13,6 +13,7 @@ import torch
 
 from tutorial_lib.config import Config, get_profile
 from tutorial_lib.datasets import SHIPPED_DATA, Dataset, load_dataset
+from tutorial_lib.files import written_whole
 from tutorial_lib.reconstruction import (
     CostReconstruction,
     episode_sums,
@@ -103,7 +104,8 @@ def run(path: Path | None = PATH, chosen=None, steps: int = STEPS) -> pd.DataFra
                 }
             )
         if path is not None:
-            pd.DataFrame(rows).to_csv(path, index=False)
+            with written_whole(path) as temporary:
+                pd.DataFrame(rows).to_csv(temporary, index=False)
     return pd.DataFrame(rows)
 
 

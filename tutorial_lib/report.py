@@ -12,9 +12,11 @@ import pandas as pd
 from tutorial_lib.bench import tables
 from tutorial_lib.datasets import SHIPPED_DATA, load_dataset, shipped_tasks
 from tutorial_lib.evaluation import with_scores
+from tutorial_lib.files import written_whole
 from tutorial_lib.logs import best_left
 from tutorial_lib.paper import CLAIMS, TABLE1
 from tutorial_lib.plotting import cost_return_plane, speed, study_figure
+from tutorial_lib.plotting.style import Picture
 from tutorial_lib.results import RESULTS, SCORES, load_results, not_run, options_of, over_seeds, verdicts
 from tutorial_lib.studies import STUDIES, get_study
 from tutorial_lib.tasks import DSRL_FRONTIER, TASKS, get_task
@@ -158,9 +160,7 @@ def write_study(name: str) -> Path | None:
     results = load_results(name)
     if not len(results):
         return None
-    path = RESULTS / f"{name}.png"
-    path.write_bytes(study_figure(name, results).small_png())
-    return path
+    return _drawn(study_figure(name, results), RESULTS / f"{name}.png")
 
 
 # --- Speed ---
@@ -186,11 +186,8 @@ def speed_text() -> str:
 
 def write_speed() -> Path | None:
     """Draw the figure of speed beside its files; None where nothing was measured."""
-    updates, path = tables.load("updates"), tables.FOLDER / "speed.png"
-    if updates is None:
-        return None
-    path.write_bytes(speed(updates).small_png())
-    return path
+    updates = tables.load("updates")
+    return None if updates is None else _drawn(speed(updates), tables.FOLDER / "speed.png")
 
 
 # --- Pages ---
@@ -231,9 +228,16 @@ def write() -> list[Path]:
     figures = [path for path in (*map(write_study, STUDIES), write_speed()) if path]
     written = pages()
     for path, text in written.items():
-        path.write_text(text)
-    pictures = [SHIPPED_DATA / "planes" / f"{name}.png" for name in shipped_tasks()]
-    for path in pictures:
-        path.parent.mkdir(exist_ok=True)
-        path.write_bytes(cost_return_plane(load_dataset(path.stem), get_task(path.stem)).small_png())
+        with written_whole(path) as temporary:
+            temporary.write_text(text)
+    pictures = [
+        _drawn(cost_return_plane(load_dataset(name), get_task(name)), SHIPPED_DATA / "planes" / f"{name}.png")
+        for name in shipped_tasks()
+    ]
     return [*written, *pictures, *figures]
+
+
+def _drawn(figure: Picture, path: Path) -> Path:
+    with written_whole(path) as temporary:
+        temporary.write_bytes(figure.small_png())
+    return path

@@ -22,6 +22,7 @@ from tutorial_lib.bench.simulation import simulation
 from tutorial_lib.bench.tables import FILES, FOLDER, with_shares
 from tutorial_lib.bench.updates import PARTS, PRODUCT, Case
 from tutorial_lib.config import PROFILES
+from tutorial_lib.files import written_whole
 from tutorial_lib.tasks import Task, get_task
 
 __all__ = ["PARTS", "bench", "full", "install", "machine", "training"]
@@ -80,10 +81,10 @@ def full(
     torch.set_num_threads(1)
     workers, busy = workers or joblib.cpu_count(), psutil.cpu_percent(interval=1)
     everything, parts = groups(), []
-    folder.mkdir(parents=True, exist_ok=True)
 
     def write(name: str, tables: list[pd.DataFrame]) -> None:
-        pd.concat(tables).to_csv(folder / FILES[name], index=False, float_format="%.6g")
+        with written_whole(folder / FILES[name]) as temporary:
+            pd.concat(tables).to_csv(temporary, index=False, float_format="%.6g")
 
     write("machine", [machine(device, busy)])
     total = (rounds + 1) * sum(map(len, everything.values())) + 10 * len(TASKS)
