@@ -47,7 +47,8 @@ def test_drives_show_each_way_and_its_unsafe_steps(name):
     costs = np.abs(way[:, 0]) > 6 if name == "BallCircle" else np.arange(10) % 3 == 0
     drive = SimpleNamespace(positions=way, costs=costs.astype(float), rewards=np.ones(10))
     figure = plotting.drives(get_task(name), {"one": drive, "two": drive})
-    titles = [f"{title}: cost {costs.sum()}, return 10" for title in ("one", "two")]
+    join = ": " if name == "BallRun" else "\n"
+    titles = [f"{title}{join}cost {costs.sum()}, return 10" for title in ("one", "two")]
     assert [ax.get_title() for ax in figure.axes] == titles
     for ax in figure.axes:
         assert labelled(ax, "the robot's way") == pytest.approx(way)

@@ -110,17 +110,22 @@ def test_a_studys_section_has_its_table_figure_and_verdicts_or_says_that_it_was_
         report.write_study("crm")
 
 
-def test_the_run_of_profile_paper_stands_beside_profile_small(folder):
-    assert report.paper_profile_table() == "*Not run.*"
+def test_the_runs_of_profile_paper_stand_beside_profile_small(folder):
+    assert report.paper_profile_table() == "*Not run.*" and report.write_paper_profile() is None
     small = load_results("table1", folder)
     paper = small[(small["seed"] == 0) & (small["algorithm"] == "C2IQL")].assign(profile="paper")
-    late, early = (paper.assign(updates=n, cost=n / 10 * paper["threshold"]) for n in (12_000, 9))
-    pd.concat([late, early]).to_csv(folder / "paper-profile.csv", index=False)
-    head, _, *rows = cells(report.paper_profile_table())
-    assert head == ["task", "run", "seeds", "small limit", "middle limit", "high limit", "reward", "cost"]
-    assert [row[1] for row in rows] == ["paper, 9 updates", "paper, 12,000 updates", "small, 5 updates"]
-    assert rows[0][2:] == ["1", *["1.00 / 0.90"] * 3, "1.00", "0.90"]
-    assert rows[2][2:] == ["3", *["1.01 / 0.50"] * 3, "1.01 ± 0.01", "0.50 ± 0.00"]
+    runs = [
+        paper.assign(cost_critics=k, updates=n, cost=n / 10 * paper["threshold"])
+        for k, n in ((2, 8), (1, 12_000), (1, 9))
+    ]
+    pd.concat(runs).to_csv(folder / "paper-profile.csv", index=False)
+    head, _, *rows = cells(report.paper_profile_table().split("\n\n")[0])
+    assert head == "task,cost_critics,run,seeds,small limit,middle limit,high limit,reward,cost".split(",")
+    assert [row[1] for row in rows] == ["1", "1", "2", "2"]
+    names = ["paper, 9 updates", "paper, 12,000 updates", "paper, 8 updates", "small, 5 updates"]
+    assert [row[2] for row in rows] == names
+    assert rows[0][3:] == ["1", *["1.00 / 0.90"] * 3, "1.00", "0.90"]
+    assert rows[3][3:] == ["3", *["1.01 / 0.50"] * 3, "1.01 ± 0.01", "0.50 ± 0.00"]
 
 
 def test_every_study_has_a_section():

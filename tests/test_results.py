@@ -1,5 +1,7 @@
 """Results per seed, intervals and verdicts against loops and made-up results; the paper's tables; figures."""
 
+import dataclasses
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -126,6 +128,15 @@ def test_a_difference_is_paired_by_seed():
 CLAIM = Claim("kappas", "more earns more", "Fig. 0", "reward_score", {"kappa_1": 0.9}, {"kappa_1": 0.5})
 
 
+def test_without_rows_every_verdict_is_not_run():
+    empty = load_results("no-such-study")
+    assert (
+        verdicts([CLAIM, dataclasses.replace(CLAIM, where={"kappa_2": 0.9})], empty)["ours"].tolist()
+        == ["not run"] * 2
+    )
+    assert over_seeds(empty).empty
+
+
 @pytest.mark.parametrize(
     ("high", "low", "noise", "seeds", "verdict"),
     [
@@ -219,6 +230,17 @@ def test_promises_draws_every_agents_means():
     (ax,) = plotting.promises(make_results([({}, 0.5, 0.8)])).axes
     line = lines_of(ax)["high limit"]
     assert line.get_xdata() == pytest.approx([56] * 3) and line.get_ydata() == pytest.approx([56, 56.7, 57.4])
+
+
+def test_expected_costs_draws_each_run_beside_what_the_data_paid():
+    log = pd.DataFrame({"cost_critics": [1, 2, 2], "update": [1000, 1000, 2000]})
+    left, right = plotting.expected_costs(
+        log.assign(cost_mean=[56.0, 70.0, 90.0], safe_fraction=[0.5, 0.4, 0.3]), recorded=55.0, unlimited=0.25
+    ).axes
+    assert lines_of(left)["the highest of 2"].get_xydata().tolist() == [[1, 70], [2, 90]]
+    assert lines_of(right)["one cost critic"].get_xydata().tolist() == [[1, 0.5]]
+    assert lines_of(left)["paid by the recorded episodes"].get_ydata() == pytest.approx([55, 55])
+    assert lines_of(right)["those told infinity"].get_ydata() == pytest.approx([0.25, 0.25])
 
 
 def test_without_rows_every_figure_says_that_nothing_was_run():

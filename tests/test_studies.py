@@ -105,6 +105,15 @@ def test_only_chooses_by_name_and_nothing_left_is_an_error(data):
         make_cells(grid, data, only="Hopper")
 
 
+def test_tasks_without_data_are_left_out(tmp_path, monkeypatch):
+    monkeypatch.setenv("DSRL_DATASET_DIR", str(tmp_path))
+    study = Study("?", (Grid(("BallRun", "CarRun"), ("BC-All",)),))
+    with pytest.raises(ValueError, match=r"the cells are none; .*CarRun.*c2iql fetch CarRun"):
+        studies.cells(study, data="dsrl")
+    make_file(tmp_path / "SafetyBallRun-v0-80-940.hdf5")
+    assert [cell.task for cell in studies.cells(study, data="dsrl")] == ["BallRun"]
+
+
 def test_the_named_studies_are_made_of_known_options_algorithms_and_tasks():
     fields = {field.name for field in dataclasses.fields(Config)}
     for name, study in studies.STUDIES.items():
@@ -248,6 +257,20 @@ def test_two_workers_do_what_one_process_does_and_a_failure_spoils_only_its_own_
     assert {path: path.stat().st_mtime_ns for path in times} == times  # finished cells are skipped
 
 
+def test_a_cell_that_the_scheduler_gives_up_is_a_failure(data, tmp_path, client, monkeypatch):
+    (cell,) = make_cells(Grid(("BallRun",), ("BC-All",), seeds=1), data)
+    submit = client.submit
+
+    def cancelled(*args, **options):
+        future = submit(time.sleep, 60, key=options["key"])
+        future.cancel()
+        return future
+
+    monkeypatch.setattr(client, "submit", cancelled)
+    found = engine.run_cells([cell], tmp_path / "runs" / "study", client, progress=False)
+    assert found == {cell.name: "cancelled: the scheduler gave it up"}
+
+
 def test_a_killed_worker_loses_no_cell_and_changes_no_number(data, tmp_path, client):
     """It is killed in the middle of a training run, after a checkpoint; another worker goes on from there."""
     chosen = make_cells(Grid(("BallRun",), ("BC-All",), ({"kappa_1": 0.6}, {"kappa_1": 0.7}), seeds=1), data)
@@ -262,7 +285,7 @@ def test_a_killed_worker_loses_no_cell_and_changes_no_number(data, tmp_path, cli
     victim = None
     while runner.is_alive() and not victim:
         time.sleep(0.02)
-        if checkpoint.exists():
+        if checkpoint.exists() and training.load_agent(checkpoint).updates:
             victim = next((w for w, keys in client.processing().items() if chosen[0].name in keys), None)
     assert victim and not results_path(chosen[0], folder).exists()
     os.kill(pids[victim], signal.SIGKILL)
@@ -278,7 +301,7 @@ def test_a_killed_worker_loses_no_cell_and_changes_no_number(data, tmp_path, cli
 def test_agents_of_the_small_profile_that_are_shipped_would_be_found(tmp_path):
     """They are an equal run of the study table1 if their data and recipe are today's."""
     own = {"AntRun": {"unsafe_price": 20.0}, "AntCircle": {"unsafe_price": 200.0, "crm_noise_rate": 0.05}}
-    own["DroneRun"] = {"time_limits": "mask"}
+    own |= {"DroneRun": {"time_limits": "mask"}, "DroneCircle": {"cost_critics": 1}}
     for cell in studies.cells(studies.STUDIES["table1"], "C2IQL"):
         assert cell.config == dataclasses.replace(PROFILES["small"], **own.get(cell.task, {}))
         assert cell.threshold is None

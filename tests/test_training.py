@@ -405,6 +405,50 @@ def test_negative_q_under_the_zero_penalty_is_warned_of(dataset):
         warnings.simplefilter("error")
         train(make_agent("C2IQL", **options, shift_rewards=True), losing, progress=False)
         train(make_agent("C2IQL", **options, unsafe_price=1.0), losing, progress=False)
+    with pytest.warns(UserWarning, match="try shift_rewards=True$"):  # CPQ knows no price
+        train(make_agent("CPQ", **options, unsafe_price=1.0), losing, progress=False)
+
+
+def test_what_is_learned_before_the_first_update_is_kept(dataset, tmp_path, monkeypatch):
+    """A reconstruction model can take longer than all updates: a run killed after it does not begin anew."""
+    agent = make_agent("C2IQL")
+    monkeypatch.setattr(agent, "update", lambda *args: 1 / 0)  # as good as a kill
+    with pytest.raises(ZeroDivisionError):
+        train(agent, dataset, run_dir=tmp_path, progress=False)
+    again = make_agent("C2IQL")
+    monkeypatch.setattr(again, "prepare", lambda *args: pytest.fail("prepared anew"))
+    log = train(again, dataset, run_dir=tmp_path, **EVERY)
+    whole = make_agent("C2IQL")
+    expected = train(whole, dataset, **EVERY)
+    assert [row["value_loss"] for row in log] == [row["value_loss"] for row in expected]
+
+
+def test_without_reconstruction_none_is_saved():
+    assert not [name for name in make_agent("C2IQL w/o CR").state() if name.startswith("reconstruction")]
+
+
+def test_a_folder_is_no_agent(tmp_path):
+    with pytest.raises(TrainingError, match="is a folder: name the agent.safetensors in it"):
+        load_agent(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "words"),
+    [
+        ("time_limits", "masked", "is 'masked', and must be one of rate, bootstrap, mask"),
+        ("crm", "Linear", "is 'Linear', and must be one of mlp, linear"),
+        ("crm_width", 0, "is 0, and must be 1 or more where crm is not 'linear'"),
+        ("batch_size", 1, "is 1, and must be 2 or more"),
+    ],
+)
+def test_an_option_that_means_nothing_is_refused(option, value, words):
+    with pytest.raises(ValueError, match=f"^{option} {words}"):
+        dataclasses.replace(CONFIG, **{option: value})
+
+
+def test_a_seed_stands_there_once():
+    with pytest.raises(ValueError, match=r"seeds \[4, 4\]: at least one, each 0 or more and there once"):
+        make_agent("BC-All", (4, 4))
 
 
 def test_a_file_of_another_number_of_runs_is_refused(dataset, tmp_path):

@@ -144,6 +144,7 @@ def evaluate(
         raise ValueError(f"--out {out}: is a folder: name a file")
     results = evaluation.evaluate(training.load_agent(agent), thresholds, episodes, workers)
     print(evaluation.summarise(results).round(3).to_string(index=False))
+    print("(low, high: 95% bootstrap intervals over episodes, all seeds pooled)")
     evaluation.save_results(results, out)
     print(f"{out}: {len(results)} episodes")
 

@@ -1,7 +1,8 @@
 """A cell of a study: one training run, its seeds together, and the episodes that its agent plays.
 
-Its name ends in a hash of all that its numbers depend on, data included, so a finished cell is a file of
-that name, and a changed option or dataset is another cell.
+Its name ends in a hash of its options, seeds and data, so a finished cell is a file of that name, and a
+changed option or dataset is another cell. The code is not in it: who changes an algorithm begins with
+another folder of runs.
 """
 
 import dataclasses
@@ -47,7 +48,7 @@ class Cell:
 
     @property
     def name(self) -> str:
-        """What it is, for people, and the hash of all that its numbers depend on, for the file system."""
+        """What it is, for people, and the hash of its options, seeds and data, for the file system."""
         parts = (self.task, self.algorithm.replace("/", ""), self.label)
         threshold = () if self.threshold is None else (f"{self.threshold:g}",)
         words = "-".join(part.replace(" ", "-") for part in (*parts, *threshold) if part)

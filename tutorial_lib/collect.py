@@ -166,7 +166,7 @@ def run_ppo(task: Task, recipe: Recipe, seed: int, folder: Path, slice_steps: in
                 raise ValueError(
                     f"{folder}: was begun with another recipe: choose another folder with --runs"
                 )
-    slices = -(-recipe.steps // slice_steps)
+    slices = -(-recipe.steps // slice_steps)  # the last one ends with the steps
     if done == slices:
         return
     episodes: list[dict] = []
@@ -177,12 +177,10 @@ def run_ppo(task: Task, recipe: Recipe, seed: int, folder: Path, slice_steps: in
         # Killed between its two files, a slice has left its state but no episodes: it is played again.
         batch = model.n_steps * model.n_envs
         model.num_timesteps = -(-done * slice_steps // batch) * batch
-    bar = tqdm(
-        total=slices * slice_steps, initial=done * slice_steps, desc=f"{task.name} seed {seed}", unit="step"
-    )
+    bar = tqdm(total=recipe.steps, initial=done * slice_steps, desc=f"{task.name} seed {seed}", unit="step")
     for index in range(done, slices):
         started = time.perf_counter()
-        goal = (index + 1) * slice_steps
+        goal = min((index + 1) * slice_steps, recipe.steps)
         clock["progress"] = index / slices
         scale = 1.0 if recipe.ramp is None else np.interp(clock["progress"], recipe.ramp, (0, 1))
         model.env.set_attr("price_scale", float(scale))
@@ -193,7 +191,7 @@ def run_ppo(task: Task, recipe: Recipe, seed: int, folder: Path, slice_steps: in
         episodes.clear()
         _save_ppo(model, folder / "state.safetensors", time.perf_counter() - started, made_with)
         _save(arrays, folder / f"episodes-{index:03d}.safetensors")
-        bar.update(slice_steps)
+        bar.update(goal - bar.n)
     bar.close()
 
 

@@ -2,7 +2,7 @@
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args, get_origin
 
 
 @dataclass(frozen=True)
@@ -80,9 +80,10 @@ class Config:
     normalise_observations: bool = True
     """Give the networks observations of mean zero and variance one."""
     unsafe_price: float | None = None
-    """None: an unsafe action is worth zero, as in the paper; where all actions are unsafe the policy is then
-    left to chance. A number: it keeps its Q_r and pays for its excess over the limit, so many times the
-    dataset's mean Q_r per cost range, as with a Lagrange multiplier that acts beyond the limit only."""
+    """For CIQL and C2IQL; CPQ always does the first. None: an unsafe action is worth zero, as in the paper;
+    where all actions are unsafe the policy is then left to chance. A number: it keeps its Q_r and pays for
+    its excess over the limit, so many times the dataset's mean Q_r per cost range, as with a Lagrange
+    multiplier that acts beyond the limit only."""
     recorded_step: bool = False
     """An action costs no less than the step that the data recorded of it, c + gamma V_c(s'), reconstructed.
     The critics are smooth; the step is exact about where cost sets in (a speed, a wall), and of two noisy
@@ -92,11 +93,18 @@ class Config:
     """Train on rewards minus their dataset minimum. The zero penalty punishes only where Q_r > 0."""
 
     def __post_init__(self):
-        """Raises ValueError for a number that means nothing where it stands."""
+        """Raises ValueError for a word or a number that means nothing where it stands."""
+        for field in dataclasses.fields(self):
+            words, value = get_args(field.type), getattr(self, field.name)
+            if get_origin(field.type) is Literal and value not in words:
+                raise ValueError(f"{field.name} is {value!r}, and must be one of {', '.join(words)}")
+        if self.crm == "mlp" and self.crm_width == 0:
+            raise ValueError("crm_width is 0, and must be 1 or more where crm is not 'linear'")
         for names, holds, words in (
             ("kappa_1 kappa_2 cost_kappa gamma", lambda x: 0 < x < 1, "between 0 and 1"),
             ("target_tau", lambda x: 0 < x <= 1, "above 0, and 1 at most"),
-            ("batch_size steps hidden_width cost_critics", lambda x: x >= 1, "1 or more"),
+            ("batch_size", lambda x: x >= 2, "2 or more"),  # half of each batch is random sequences
+            ("steps hidden_width cost_critics", lambda x: x >= 1, "1 or more"),
             (
                 "value_lr critic_lr policy_lr awr_alpha unsafe_price hidden_layers "
                 "crm_width crm_layers crm_steps crm_noise crm_noise_rate",

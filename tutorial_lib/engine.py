@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import dask
-from distributed import Client, LocalCluster, as_completed, get_worker
+from distributed import Client, Future, LocalCluster, as_completed, get_worker
 from distributed.scheduler import KilledWorker
 from tqdm.auto import tqdm
 
@@ -64,8 +64,8 @@ def run_cells(chosen: list[Cell], folder: Path, client: Client, progress: bool =
             for cell in waiting.values()
         ]
         for done, future in enumerate(as_completed(futures), len(chosen) - len(waiting) + 1):
-            if future.status == "error":
-                failures[future.key] = _one_line(future.exception())
+            if future.status != "finished":
+                failures[future.key] = _reason(future)
             heard((None, (future.key, waiting[future.key].config.steps)))
             lost = f", {len(failures)} failed" if failures else ""
             bar.set_description(f"{done - len(failures)} of {len(chosen)} cells done{lost}")
@@ -80,7 +80,10 @@ def _run_on_worker(cell: Cell, folder: Path) -> None:
         run_cell(cell, folder, lambda updates: worker.log_event(TOPIC, (cell.name, updates)))
 
 
-def _one_line(error: BaseException) -> str:
+def _reason(future: Future) -> str:
+    if future.status != "error":
+        return f"{future.status}: the scheduler gave it up"
+    error = future.exception()
     if isinstance(error, KilledWorker):
         return "its process died again and again (out of memory?)"
     return f"{type(error).__name__}: {' '.join(str(error).split())}"

@@ -100,8 +100,9 @@ def train_reconstruction(
         rows = torch.cat(
             [torch.randint(*end, (config.batch_size // 2,), generator=generator) for end in ends]
         )
-        rows = rows.to(device)
-        noise = noise_std.float() * torch.randn(len(rows), x.shape[1], generator=generator).to(device)
+        noise = torch.randn(len(rows), x.shape[1], generator=generator)
+        rows, noise = (draw.to(device, non_blocking=True) for draw in (rows, noise))
+        noise = noise_std.float() * noise
         loss = (model(x[rows] + noise) - y[rows]).square().mean() / task.horizon**2  # lines 7 and 14 at once
         optimiser.zero_grad()
         loss.backward()

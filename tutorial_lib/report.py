@@ -7,15 +7,18 @@ is written here and nowhere else, and a test fails where it is out of date.
 import hashlib
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 
 from tutorial_lib.bench import tables
+from tutorial_lib.conditioning import threshold_set
+from tutorial_lib.config import get_profile
 from tutorial_lib.datasets import SHIPPED_DATA, load_dataset, shipped_tasks
 from tutorial_lib.evaluation import with_scores
 from tutorial_lib.files import written_whole
 from tutorial_lib.logs import best_left
 from tutorial_lib.paper import CLAIMS, TABLE1
-from tutorial_lib.plotting import cost_return_plane, speed, study_figure
+from tutorial_lib.plotting import cost_return_plane, expected_costs, speed, study_figure
 from tutorial_lib.plotting.style import Picture
 from tutorial_lib.results import RESULTS, SCORES, load_results, not_run, options_of, over_seeds, verdicts
 from tutorial_lib.studies import STUDIES, get_study
@@ -76,7 +79,10 @@ def results_table(results: pd.DataFrame | None = None) -> str:
 
 def baselines_table() -> str:
     """Our algorithms on all tasks, what was not run, and the paper's: mean reward / mean cost."""
-    found = over_seeds(load_results("table1")).set_index(["algorithm", "task"])
+    results = load_results("table1")
+    if not len(results):
+        return f"*{not_run('table1').capitalize()}.*"
+    found = over_seeds(results).set_index(["algorithm", "task"])
     run = found.index.get_level_values(0).unique()
     missing = [name for name in ("BC-All", "BC-Safe", *TABLE1) if name not in run]
     rows = []
@@ -125,14 +131,27 @@ def study_table(results: pd.DataFrame) -> pd.DataFrame:
 
 
 def paper_profile_table() -> str:
-    """The run of profile `paper`, by the updates that it had made, and profile `small` on the same data."""
+    """The runs of profile `paper`, by the updates that they had made, and `small` on the same data."""
     paper, small = load_results("paper-profile"), load_results("table1")
     if not len(paper):
         return "*Not run.*"
     same = small["task"].isin(paper["task"]) & (small["algorithm"] == "C2IQL")
-    both = pd.concat([paper.sort_values("updates", kind="stable"), small[same]])
+    paper = paper.sort_values(["cost_critics", "updates"], kind="stable")
+    both = pd.concat([paper, small[same].assign(cost_critics=get_profile("small").cost_critics)])
     words = both["profile"] + ", " + both["updates"].map("{:,} updates".format)
-    return markdown(study_table(both.assign(run=words)))
+    table = markdown(study_table(both.assign(run=words)))
+    return f"{table}\n\n![what the critics expect](results/paper-profile.png)"
+
+
+def write_paper_profile() -> Path | None:
+    """Draw what the critics of profile `paper` come to expect; None where it was not run."""
+    log = load_results("paper-profile-training")
+    if not len(log):
+        return None
+    task = get_task(load_results("paper-profile")["task"].iloc[0])
+    told = threshold_set(task, with_zero=get_profile("paper").zero_threshold)
+    figure = expected_costs(log, load_dataset(task.name).episode_costs.mean(), np.isinf(told).mean())
+    return _drawn(figure, RESULTS / "paper-profile.png")
 
 
 def study_section(name: str) -> str:
@@ -225,7 +244,7 @@ def pages() -> dict[Path, str]:
 
 def write() -> list[Path]:
     """Bring the pages, the pictures of the datasets and the studies' figures up to date. Returns them all."""
-    figures = [path for path in (*map(write_study, STUDIES), write_speed()) if path]
+    figures = [path for path in (*map(write_study, STUDIES), write_paper_profile(), write_speed()) if path]
     written = pages()
     for path, text in written.items():
         with written_whole(path) as temporary:

@@ -97,7 +97,7 @@ def verdicts(claims: Sequence[Claim], results: pd.DataFrame) -> pd.DataFrame:
     for claim in claims:
         chosen = results
         for key, value in claim.where.items():
-            chosen = chosen[chosen[key] == value]
+            chosen = chosen[chosen[key] == value] if key in chosen else chosen[:0]  # not run
         for task in chosen["task"].unique() if len(chosen) else ["-"]:
             part = chosen[chosen["task"] == task]
             values = difference(part, claim.score, claim.high, claim.low) if len(part) else np.array([])

@@ -14,7 +14,7 @@ from pathlib import Path
 from tutorial_lib.algorithms import get_algorithm
 from tutorial_lib.cells import Cell
 from tutorial_lib.config import Config, get_profile
-from tutorial_lib.datasets import find_dataset, load_dataset, shipped_tasks
+from tutorial_lib.datasets import DatasetError, find_dataset, load_dataset
 from tutorial_lib.tasks import TASKS, get_task
 
 
@@ -52,13 +52,16 @@ PAIR = ("BallRun", "CarCircle")  # a short horizon and a long one: the smallest 
 OWN_OPTIONS = {
     "DroneRun": {"time_limits": "mask"},
     "AntRun": {"unsafe_price": 20.0},
+    "DroneCircle": {"cost_critics": 1},
     "AntCircle": {"unsafe_price": 200.0, "crm_noise_rate": 0.05},
 }
 """What a task changes in the profile. DroneRun's agents stayed below the speed limit whatever they might
 spend, at a normalised reward of 0.61 under a limit of 110; with masked time limits they have 0.70. One
 action of an ant's gait hardly shows in its cost: at profile `small`'s price of 6 an agent paid 43 under
-AntRun's limit of 30, and 98 under AntCircle's of 40. There the critics' heads differ mostly by error, and a
-reconstruction model that is told so (with the price, five seeds) made that 55."""
+AntRun's limit of 30, and 98 under AntCircle's of 40. On AntCircle the critics' heads differ mostly by error,
+and a reconstruction model that is told so (with the price, five seeds) made that 55. On DroneCircle the
+highest of two cost critics expected 52, 60 and 69 under the three limits, and 6, 10 and 13 were paid; one
+alone expects 20, 29 and 34, and 22, 32 and 36 are paid, for 0.05 more of normalised reward."""
 
 SLOW_TARGETS = {"target_tau": 0.01}
 """For an actor that asks about its own actions: on BallCircle at 50, CPQ (seed 0) had a normalised reward and
@@ -97,6 +100,10 @@ STUDIES: dict[str, Study] = {
     "thresholds-per": Study(
         "One threshold per sample, or one per batch?",
         (Grid(PAIR, options=({"thresholds_per": "sample"}, {"thresholds_per": "batch"})),),
+    ),
+    "cost-critics": Study(
+        "One cost critic, or the one of two that expects the most cost?",
+        (Grid(PAIR, options=({"cost_critics": 1}, {"cost_critics": 2})),),
     ),
     "infinite-at-test": Study(
         "When should the policy be told that nothing limits it any more?",
@@ -139,14 +146,17 @@ def cells(
 ) -> list[Cell]:
     """The study's cells whose name fits the pattern `only` (as of file names, anywhere in it).
 
-    `change` is applied to every configuration last. Tasks without a dataset are left out where it is the
-    shipped one. Raises ValueError where nothing is left.
+    `change` is applied to every configuration last. Tasks without a dataset are left out. Raises ValueError
+    where nothing is left.
     """
-    columns, made = varied_options(study), {}
+    columns, made, missing = varied_options(study), {}, ""
     for grid in study.grids:
-        tasks = [task for task in grid.tasks if data != "shipped" or task in shipped_tasks()]
-        for task, algorithm, options in itertools.product(tasks, grid.algorithms, grid.options):
-            path = find_dataset(task, data)
+        for task, algorithm, options in itertools.product(grid.tasks, grid.algorithms, grid.options):
+            try:
+                path = find_dataset(task, data)
+            except DatasetError as error:
+                missing = f"; {error}"
+                continue
             checksum = _checksum(task, path, path.stat().st_mtime_ns)
             kind = get_algorithm(algorithm)
             fixed = kind.constrained and not kind.conditioned
@@ -168,7 +178,7 @@ def cells(
                 made[cell.name] = cell
     chosen = [cell for name, cell in made.items() if fnmatch.fnmatchcase(name, f"*{only}*")]
     if not chosen:
-        raise ValueError(f"no cell fits {only!r}: the cells are {', '.join(made) or 'none, without data'}")
+        raise ValueError(f"no cell fits {only!r}: the cells are {', '.join(made) or 'none'}{missing}")
     return chosen
 
 

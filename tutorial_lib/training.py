@@ -50,13 +50,16 @@ def train(
     steps = agent.config.steps if steps is None else steps
     generators = [torch.Generator().manual_seed(seed) for seed in agent.seeds]
     agent.data_checksum = dataset.checksum
-    log = _resume(agent, generators, run_dir) if run_dir and (run_dir / CHECKPOINT).exists() else []
+    resumes = run_dir is not None and (run_dir / CHECKPOINT).exists()
+    log = _resume(agent, generators, run_dir) if resumes else []
     dataset = agent.select_episodes(dataset)
     if agent.config.shift_rewards:
         dataset = dataclasses.replace(dataset, rewards=dataset.rewards - dataset.rewards.min())
     with products(precision):
-        if not agent.updates:
+        if not (resumes or agent.updates):
             agent.prepare(dataset, progress)
+            if run_dir:  # a reconstruction model can take longer than all updates
+                save_checkpoint(agent, generators, log, run_dir)
         data = _training_data(dataset, agent)
         bar = tqdm(
             total=steps,
@@ -91,10 +94,11 @@ def train(
 
 def _warn_of_negative_q(agent: Agent, log: list[dict]) -> None:
     share = max((row.get("negative_q", 0.0) for row in log[-len(agent.seeds) :]), default=0.0)
-    if share > 0.01 and agent.config.unsafe_price is None and not agent.config.shift_rewards:
+    priced = agent.can_price and agent.config.unsafe_price is not None
+    if share > 0.01 and not priced and not agent.config.shift_rewards:
         warnings.warn(
             f"{share:.0%} of Q_r are negative: the zero penalty rewards unsafe actions there; "
-            "try shift_rewards=True, or an unsafe_price",
+            f"try shift_rewards=True{', or an unsafe_price' if agent.can_price else ''}",
             stacklevel=3,
         )
 
@@ -158,6 +162,8 @@ def _save(agent: Agent, path: Path, tensors: dict[str, torch.Tensor]) -> None:
 def load_agent(path: Path | str, device="cpu") -> Agent:
     """The agent that `save_agent` wrote. Raises TrainingError for a file that is not one, or is damaged."""
     path = Path(path)
+    if path.is_dir():
+        raise TrainingError(f"{path}: is a folder: name the agent.safetensors in it")
     try:
         with safe_open(path, "pt") as file:
             header = file.metadata() or {}
@@ -198,10 +204,10 @@ def _resume(agent: Agent, generators: list[torch.Generator], run_dir: Path) -> l
     mine = (agent.task, agent.name, agent.config, agent.seeds, agent.threshold)
     if mine != (saved.task, saved.name, saved.config, saved.seeds, saved.threshold):
         raise TrainingError(
-            f"{path}: is of another run (task, algorithm, options or seeds): choose another folder"
+            f"{path}: is of another run (task, algorithm, options or seeds): choose another folder (--out)"
         )
     if saved.data_checksum not in (None, agent.data_checksum):
-        raise TrainingError(f"{path}: was trained on other data: choose another folder")
+        raise TrainingError(f"{path}: was trained on other data: choose another folder (--out)")
     try:
         with safe_open(path, "pt") as file:
             agent.load_state({key: file.get_tensor(key) for key in file.keys()})  # noqa: SIM118

@@ -37,6 +37,7 @@ class Agent:
     name: str
     conditioned = False  # does the policy take the limit as an input?
     constrained = True  # does training know a limit at all?
+    can_price = False  # does it read `unsafe_price`?
     targets: tuple[str, ...] = ()  # networks with a Polyak-averaged copy
     frozen: tuple[str, ...] = ()  # networks that a loss looks through without training them
 
@@ -57,8 +58,8 @@ class Agent:
             )
             raise ValueError(f"{self.name} {verb}")
         self.task, self.config, self.seeds, self.device = task, config, tuple(seeds), torch.device(device)
-        if not self.seeds or min(self.seeds) < 0:
-            raise ValueError(f"seeds {list(self.seeds)}: at least one, each 0 or more")
+        if not self.seeds or min(self.seeds) < 0 or len(set(self.seeds)) < len(self.seeds):
+            raise ValueError(f"seeds {list(self.seeds)}: at least one, each 0 or more and there once")
         self.threshold = None if threshold is None else check_threshold(threshold)
 
         self.observation_mean = torch.zeros(task.obs_dim, device=self.device)
@@ -203,7 +204,7 @@ class Agent:
             return mean.cpu().numpy()
 
     def predicted_cost(self, observations, limit, run: int = 0) -> np.ndarray:
-        """The episode cost that the critics expect of the policy's action, (E,); NaN where there are none."""
+        """The episode cost that the critics expect of the policy's action, (E,); NaN from all but C2IQL."""
         return np.full(len(observations), np.nan)
 
     def fill_last_bias(self, names: Sequence[str], value: float) -> None:
@@ -257,7 +258,7 @@ class Agent:
         self.updates = int(tensors["updates"])
 
     def __getstate__(self):
-        """What a worker process needs to act: not what only training needs."""
+        """What a worker process needs to act: without the optimiser and the lent networks."""
         return {key: value for key, value in vars(self).items() if key not in ("optimiser", "borrowers")}
 
     def _build_seeded(self, seed: int) -> dict[str, nn.Module]:

@@ -19,13 +19,16 @@ class C2IQL(Agent):
     name = "C2IQL"
     targets = ("critics", "cost_critics")
     conditioned = True
+    can_price = True
     reconstructs = True
 
     def __init__(self, task, config, *args, **kwargs):
         self.cost_gammas = task.gammas if self.reconstructs else (config.gamma,)
         super().__init__(task, config, *args, **kwargs)
         self.gammas = torch.tensor(self.cost_gammas, device=self.device)  # (m,)
-        self.reconstruction = CostReconstruction(task, config).to(self.device).requires_grad_(False)
+        if self.reconstructs:  # untrained until `prepare` or `load_state`
+            with torch.random.fork_rng(devices=[]):
+                self.reconstruction = CostReconstruction(task, config).to(self.device).requires_grad_(False)
 
     def build(self):
         task, config = self.task, self.config
@@ -133,12 +136,16 @@ class C2IQL(Agent):
             return self.episode_cost(self.network("cost_critics", run)(s, action)).amax(0).cpu().numpy()
 
     def state(self):
+        if not self.reconstructs:
+            return super().state()
         model = {f"reconstruction.{key}": value for key, value in self.reconstruction.state_dict().items()}
         return super().state() | model
 
     def load_state(self, tensors):
         prefix = "reconstruction."
         super().load_state(tensors)
+        if not self.reconstructs:
+            return
         model = {key.removeprefix(prefix): value for key, value in tensors.items() if key.startswith(prefix)}
         self.reconstruction.load_state_dict(model)
 

@@ -12,6 +12,7 @@ class CIQL(Agent):
     """Equations 11 to 18 for one threshold L: costs are discounted once and compared with L~ (eq. 2)."""
 
     name = "CIQL"
+    can_price = True
     targets = ("critics", "cost_critics")
 
     def build(self):

@@ -92,7 +92,9 @@ def full(
         for name, cases in everything.items():
             parts.append(measure(cases, rounds, seconds, device, bar.update, missing).assign(group=name))
             write("updates", parts)
-        if busy > BUSY:
+        if str(device) != "cpu":
+            missing(f"{workers} processes at once: measured on the CPU only")
+        elif busy > BUSY:
             missing(f"{workers} processes at once: not measured, others take {busy:.0f}% of the cores")
         else:
             together = side_by_side(Case("C2IQL", TASKS[0]), workers, rounds)

@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-import numpy as np
 import pandas as pd
 
 from tutorial_lib.bench.cases import SMALL_CRM, TASKS
@@ -51,9 +50,9 @@ def case_of(name: str) -> dict:
     return dict(zip(("what", "products", "crm"), NAMES[name], strict=True))
 
 
-def ratio(updates: pd.DataFrame, slow: dict, fast: dict) -> float:
-    """How many times as fast: the median of the rounds' ratios, NaN where one was not measured."""
-    return float((seconds(updates, **slow) / seconds(updates, **fast)).median())
+def ratios(updates: pd.DataFrame, slow: dict, fast: dict) -> pd.Series:
+    """How many times as fast, by round; empty, or NaN, where one was not measured."""
+    return seconds(updates, **slow) / seconds(updates, **fast)
 
 
 def yardsticks(updates: pd.DataFrame) -> pd.DataFrame:
@@ -70,7 +69,7 @@ def yardsticks(updates: pd.DataFrame) -> pd.DataFrame:
             row.setdefault("GFLOP", f"{own['flop'].iloc[0] / 1e9:.1f}")
             row[f"{task}: updates/s"] = f"{1 / own['seconds'].median():.1f}"
             row[f"{task}: share"] = f"{own['share'].median():.0%}"
-            row[f"{task}: x plain"] = f"{ratio(part, case_of(EAGER), case):.2f}"
+            row[f"{task}: x plain"] = f"{ratios(part, case_of(EAGER), case).median():.2f}"
         rows.append(row)
     columns = ["profile `paper`", "GFLOP"]
     columns += [f"{task}: {x}" for task in TASKS for x in ("updates/s", "share", "x plain")]
@@ -78,7 +77,7 @@ def yardsticks(updates: pd.DataFrame) -> pd.DataFrame:
 
 
 def marks(updates: pd.DataFrame) -> pd.DataFrame:
-    """What was aimed at, and what was found: ratios of one run, the median over rounds, for both tasks."""
+    """What was aimed at, and what was found in one run: ratios, median (lowest to highest) over rounds."""
     ours, small, plain = case_of(OURS), case_of(SMALL), case_of(EAGER)
     aims = {
         "arithmetic, against that of one large product": (0.8, None),
@@ -91,19 +90,18 @@ def marks(updates: pd.DataFrame) -> pd.DataFrame:
         row = {"mark": aim, "aim": "" if wanted is None else f"{wanted:g}"}
         for task in TASKS:
             part = with_shares(updates[updates["group"] == f"yardsticks {task}"])
-            found = ratio(part, *pair) if pair else _select(part, ours)["share"].median()
-            row[task] = _number(found)
+            row[task] = _in_words(ratios(part, *pair) if pair else _select(part, ours)["share"])
         rows.append(row)
     both = updates[updates["group"] == "processes"]
     most = both["processes"].max()
     alone, together = ({"processes": count} for count in (1, most))
     rows.append({"mark": "two processes on two cores, x one", "aim": "1.9"})
-    rows[-1][TASKS[0]] = _number(ratio(both, alone, together) if most == 2 else np.nan)
+    rows[-1][TASKS[0]] = _in_words(ratios(both, alone, together) if most == 2 else pd.Series())
     seeds = updates[updates["group"] == "seeds"]
     for profile in ("paper", "small"):
-        found = ratio(seeds, {"profile": profile, "runs": 5}, {"profile": profile, "runs": 1})
+        found = ratios(seeds, {"profile": profile, "runs": 5}, {"profile": profile, "runs": 1})
         row = {"mark": f"cost of five seeds together, x one, profile `{profile}`", "aim": "at most 4"}
-        rows.append(row | {TASKS[0]: _number(found)})
+        rows.append(row | {TASKS[0]: _in_words(found)})
     return pd.DataFrame(rows)
 
 
@@ -137,7 +135,7 @@ def growth(updates: pd.DataFrame) -> pd.DataFrame:
         for profile, own in part.groupby("profile", sort=False):
             sizes = own[column].unique()
             words = [f"{size:,}: {seconds(own, **{column: size}).median() * 1e3:.3g}" for size in sizes]
-            last = ratio(own, {column: sizes[-1]}, {column: sizes[0]})
+            last = ratios(own, {column: sizes[-1]}, {column: sizes[0]}).median()
             times = f"{sizes[-1] / sizes[0]:g} x as many cost {last:.2f} x"
             row = {"what grows": group, "profile": profile, "ms per update": "; ".join(words)}
             rows.append(row | {"growth": times})
@@ -170,5 +168,6 @@ def _select(updates: pd.DataFrame, case: dict) -> pd.DataFrame:
     return updates
 
 
-def _number(value: float) -> str:
-    return "not measured" if np.isnan(value) else f"{value:.2f}"
+def _in_words(found: pd.Series) -> str:
+    found = found.dropna()
+    return f"{found.median():.2f} ({found.min():.2f} to {found.max():.2f})" if len(found) else "not measured"

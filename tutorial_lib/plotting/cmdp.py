@@ -59,7 +59,7 @@ def drives(task: Task, episodes: dict):
                       length, zeros[:1])  # fmt: skip
         _draw_path(ax, one, 0, task)
         summary = f"cost {np.sum(drive.costs):.0f}, return {np.sum(drive.rewards):.0f}"
-        ax.set_title(f"{title}: {summary}")
+        ax.set_title(f"{title}: {summary}" if run else f"{title}\n{summary}")  # a Circle's panel is narrow
         ax.label_outer()
     legend_below(figure, *axes.flat)
     return figure

@@ -58,16 +58,11 @@ def courses(panels: dict):
         for label, course in found.items():
             look = {"color": COST} if label == "maximum" else {"color": REWARD, "alpha": next(blues)}
             ax.plot(course.updates, course.q, label=label, **look)
-        levels = (
-            (achieved, "achieved", "right"),
-            (ceiling, "ceiling", "left"),
-        )
-        for level, words, side in levels:
+        labels = ((achieved, "achieved", "top", -4), (ceiling, "ceiling", "bottom", 4))
+        for level, words, va, offset in labels:
             ax.axhline(level, **DASHED | {"linewidth": 1.5})
-            left = side == "left"
-            place = {"xy": (0.01 if left else 0.99, level), "xycoords": ("axes fraction", "data")}
-            place |= {"xytext": (0, 4 if left else -4), "textcoords": "offset points"}
-            ax.annotate(words, ha=side, va="bottom" if left else "top", fontsize=13, **place)
+            place = {"xy": (0.01, level), "xycoords": ("axes fraction", "data"), "xytext": (0, offset)}
+            ax.annotate(words, va=va, textcoords="offset points", fontsize=13, **place)
         ax.set(title=title, xlabel="updates", yscale="log")
         ax.xaxis.set_major_locator(ticker.MaxNLocator(4))
         ax.yaxis.set_major_locator(ticker.LogLocator(subs=(1, 3)))

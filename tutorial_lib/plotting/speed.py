@@ -4,7 +4,7 @@ import numpy as np
 
 from tutorial_lib.bench.cases import TASKS
 from tutorial_lib.bench.peers import PEERS
-from tutorial_lib.bench.tables import NAMES, OURS, case_of, ratio, seconds
+from tutorial_lib.bench.tables import NAMES, OURS, case_of, ratios, seconds
 from tutorial_lib.bench.updates import EAGER
 from tutorial_lib.plotting.studies import or_not_run
 from tutorial_lib.plotting.style import DASHED, NEUTRAL, REWARD, one_figure, subplots
@@ -32,7 +32,7 @@ def speed(updates):
     counts = sorted(part["runs"].unique())
     for profile, marker in (("paper", "o"), ("small", "s")):
         own = part[(part["profile"] == profile) & (part["what"] == OURS)]
-        costs = [ratio(own, {"runs": count}, {"runs": counts[0]}) for count in counts]
+        costs = [ratios(own, {"runs": count}, {"runs": counts[0]}).median() for count in counts]
         looks = {"marker": marker, "color": REWARD, "alpha": 1 if profile == "paper" else 0.5}
         right.plot(counts, costs, **looks, label=f"profile {profile}")
     right.plot(counts, counts, **DASHED, label="one after the other")

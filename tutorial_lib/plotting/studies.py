@@ -245,6 +245,26 @@ def promises(results):
     return figure
 
 
+@one_figure
+def expected_costs(log, recorded: float, unlimited: float):
+    """What long runs come to expect of the recorded actions: their mean cost, and the share that looks safe.
+
+    `log` has a row for each `cost_critics` and logged `update`; `recorded` is the mean cost of the recorded
+    episodes, `unlimited` the share of the transitions that are told infinity.
+    """
+    figure, axes = subplots(1, 2, figsize=(12, 4.6))
+    panels = (("cost_mean", "expected cost of recorded actions"), ("safe_fraction", "share that looks safe"))
+    for ax, (column, title) in zip(axes, panels, strict=True):
+        for index, (count, run) in enumerate(log.groupby("cost_critics")):
+            words = "one cost critic" if count == 1 else f"the highest of {count}"
+            ax.plot(run["update"] / 1000, run[column], color=VARIANTS[index], linewidth=1.5, label=words)
+        ax.set(title=title, xlabel="thousand updates", ylim=(0, None))
+    axes[0].axhline(recorded, **DASHED, label="paid by the recorded episodes")
+    axes[1].axhline(unlimited, color=COST, linestyle=":", label="those told infinity")
+    legend_below(figure, *axes)
+    return figure
+
+
 def study_figure(name: str, results):
     """The figure that belongs to a study."""
     figures = {"kappas": expectiles, "crm-noise": noise_levels, "table1": per_limit}
