@@ -45,7 +45,7 @@ class C2IQL(Agent):
 
     def prepare(self, dataset, progress=True):
         super().prepare(dataset, progress)
-        if self.reconstructs:
+        if self.reconstructs:  # one model, which all runs share
             self.reconstruction = train_reconstruction(
                 self.task, self.config, dataset, device=self.device, progress=progress
             )
