@@ -17,7 +17,7 @@ BIN := $(VENV)/bin/python
 READY := $(VENV)/ready
 PIP := $(BIN) -m pip install --quiet
 
-NOTEBOOKS := $(sort $(wildcard notebooks/*.ipynb))
+NOTEBOOKS := $(sort $(wildcard notebooks/[0-9]*.ipynb))
 EXECUTED := $(NOTEBOOKS:%=build/pages/%)
 WHAT_NOTEBOOKS_USE := $(shell find tutorial_lib data -type f -not -name '*.pyc')
 
@@ -26,6 +26,9 @@ WHAT_NOTEBOOKS_USE := $(shell find tutorial_lib data -type f -not -name '*.pyc')
 export OMP_NUM_THREADS := 1
 export MKL_NUM_THREADS := 1
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
+# The course's pages are UTF-8, and its notebooks know nothing of their reader's own IPython settings.
+export PYTHONUTF8 := 1
+export IPYTHONDIR := $(CURDIR)/build/ipython
 
 .PHONY: course slides student test lab notebooks lock clean
 .NOTPARALLEL:
@@ -55,7 +58,7 @@ student: $(READY)
 test: $(READY)
 	$(BIN) -m pytest --durations=10 tests
 	$(if $(NOTEBOOKS),$(BIN) -m pytest --durations=10 --nbval-lax --nbval-current-env --nbval-cell-timeout 600 \
-		--nbval-sanitize-with tests/sanitize.cfg notebooks)
+		--nbval-sanitize-with tests/sanitize.cfg $(NOTEBOOKS))
 
 lab: $(READY)
 	$(BIN) -m jupyterlab --ip=127.0.0.1 --LabApp.default_url=/lab/tree/notebooks \

@@ -84,7 +84,7 @@ def finish_page(app, docname, source):
 def contents(folder: Path) -> str:
     """A table of the notebooks: title, question and time, from the first cell of each."""
     rows = ["| notebook | question | time |", "|---|---|---|"]
-    for path in sorted(folder.glob("notebooks/*.ipynb")):
+    for path in sorted(folder.glob("notebooks/[0-9]*.ipynb")):
         text = "".join(json.loads(path.read_text())["cells"][0]["source"])
         title = re.search(r"^# (.+)", text)[1]
         question = " ".join(re.findall(r"^> (.+)", text, re.MULTILINE)).strip("*")

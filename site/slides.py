@@ -71,7 +71,7 @@ def copy_scripts(target: Path) -> None:
 def main(source: Path, target: Path) -> None:
     copy_scripts(target / "scripts")
     titles = {}
-    for path in sorted(source.glob("*.ipynb")):
+    for path in sorted(source.glob("[0-9]*.ipynb")):
         name = path.with_suffix(".html").name
         (target / name).write_text(convert(path), encoding="utf-8")
         titles[name] = title_of(nbformat.read(path, as_version=4))

@@ -79,7 +79,7 @@ def _raise_where_left_open(source: str) -> str:
 
 def main(source: Path, target: Path) -> None:
     target.mkdir(parents=True, exist_ok=True)
-    for path in sorted(source.glob("*.ipynb")):
+    for path in sorted(source.glob("[0-9]*.ipynb")):
         notebook = nbformat.read(path, as_version=4)
         without_solutions(notebook)
         nbformat.write(notebook, target / path.name)

@@ -47,7 +47,17 @@ def _scopes(table):
 
 def _binds(source):
     names = symtable.symtable(source, "cell", "exec").get_symbols()
-    return {name.get_name() for name in names if name.is_assigned() or name.is_imported()}
+    bound = {name.get_name() for name in names if name.is_assigned() or name.is_imported()}
+    return bound - _of_comprehensions(source)
+
+
+def _of_comprehensions(source):
+    """Variables of comprehensions alone, which Python 3.12 and newer count among the code's around them."""
+    nodes = list(ast.walk(ast.parse(source)))
+    targets = [node.target for node in nodes if isinstance(node, ast.comprehension)]
+    inside = [node for target in targets for node in ast.walk(target) if isinstance(node, ast.Name)]
+    stored = [node for node in nodes if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)]
+    return {node.id for node in inside} - {node.id for node in stored if node not in inside}
 
 
 def _changes(source):
@@ -64,4 +74,5 @@ def _reads(source):
     top = symtable.symtable(source, "cell", "exec")
     names = [(scope is top, name) for scope in _scopes(top) for name in scope.get_symbols()]
     read = [(at_top, name) for at_top, name in names if name.is_referenced()]
-    return {name.get_name() for at_top, name in read if at_top or name.is_global()}
+    names = {name.get_name() for at_top, name in read if at_top or name.is_global()}
+    return names - _of_comprehensions(source)

@@ -297,4 +297,4 @@ def test_bench_prints_both_tables(c2iql, monkeypatch):
         assert len(shares) == len(bench.PARTS) and 98 <= sum(shares) <= 102
         assert float(row[2]) > 1
     assert ["bare", "simulator", "1"] in [line[:3] for line in lines]
-    assert any(line[:2] == ["rollouts", "1"] and 0 < int(line[3].rstrip("%")) < 200 for line in lines)
+    assert any(line[:2] == ["rollouts", "1"] and int(line[3].rstrip("%")) > 0 for line in lines)

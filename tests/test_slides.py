@@ -9,7 +9,7 @@ import pytest
 import slides
 from marks import LINES, remove_marks
 
-NOTEBOOKS = sorted(Path(__file__).parents[1].glob("notebooks/*.ipynb"))
+NOTEBOOKS = sorted(Path(__file__).parents[1].glob("notebooks/[0-9]*.ipynb"))
 
 
 @pytest.fixture(scope="module")
