@@ -297,4 +297,10 @@ def test_bench_prints_both_tables(c2iql, monkeypatch):
         assert len(shares) == len(bench.PARTS) and 98 <= sum(shares) <= 102
         assert float(row[2]) > 1
     assert ["bare", "simulator", "1"] in [line[:3] for line in lines]
-    assert any(line[:2] == ["rollouts", "1"] and int(line[3].rstrip("%")) > 0 for line in lines)
+    assert any(line[:2] == ["rollouts", "1"] and 0 < int(line[3].rstrip("%")) < 200 for line in lines)
+
+
+def test_options_that_fit_together_come_in_any_order():
+    for options in (("crm=linear", "crm_width=0"), ("crm_width=0", "crm=linear")):
+        config = cli.with_options(cli.get_profile("small"), options)
+        assert (config.crm, config.crm_width) == ("linear", 0)

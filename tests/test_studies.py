@@ -15,7 +15,14 @@ from tutorial_lib import cells as cells_module
 from tutorial_lib import engine, studies, training
 from tutorial_lib.cells import collect, find_trained, results_path, run_cell
 from tutorial_lib.config import PROFILES, Config
-from tutorial_lib.datasets import SHIPPED_DATA, Dataset, load_dataset, read_dataset, write_dataset
+from tutorial_lib.datasets import (
+    SHIPPED_DATA,
+    Dataset,
+    DatasetError,
+    load_dataset,
+    read_dataset,
+    write_dataset,
+)
 from tutorial_lib.evaluation import evaluate
 from tutorial_lib.studies import Grid, Study
 
@@ -108,7 +115,7 @@ def test_only_chooses_by_name_and_nothing_left_is_an_error(data):
 def test_tasks_without_data_are_left_out(tmp_path, monkeypatch):
     monkeypatch.setenv("DSRL_DATASET_DIR", str(tmp_path))
     study = Study("?", (Grid(("BallRun", "CarRun"), ("BC-All",)),))
-    with pytest.raises(ValueError, match=r"the cells are none; .*CarRun.*c2iql fetch CarRun"):
+    with pytest.raises(DatasetError, match=r"CarRun.*no such file: `c2iql fetch CarRun`"):
         studies.cells(study, data="dsrl")
     make_file(tmp_path / "SafetyBallRun-v0-80-940.hdf5")
     assert [cell.task for cell in studies.cells(study, data="dsrl")] == ["BallRun"]

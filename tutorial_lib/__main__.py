@@ -270,6 +270,7 @@ def report(name: Positional[str | None] = None) -> None:
 def with_options(config: Config, options: tuple[str, ...]) -> Config:
     """The config with `name=value` changes; values are read as the field's own type. Raises ValueError."""
     types = {field.name: field.type for field in dataclasses.fields(Config) if field.name != "profile"}
+    changes = {}
     for option in options:
         name, equals, text = option.partition("=")
         if not equals or name not in types:
@@ -280,8 +281,8 @@ def with_options(config: Config, options: tuple[str, ...]) -> Config:
         except SystemExit:
             kind = "True or False" if types[name] is bool else inspect.formatannotation(types[name])
             raise ValueError(f"--option {option}: the value must be {kind}") from None
-        config = dataclasses.replace(config, **{name: value})
-    return config
+        changes[name] = value
+    return dataclasses.replace(config, **changes)  # at once: what fits together may come in any order
 
 
 def check_counts(**numbers: int | None) -> None:

@@ -46,9 +46,9 @@ class Config:
     crm_width: int = 512
     crm_layers: int = 5
     crm_steps: int = 1_000_000
-    """Iterations of Algorithm 1 (the paper says epochs; one pass over random data has no end). On one core a
-    million of them at 5 x 512 take twice as long as all updates; 20,000 at 3 x 128 are as exact on whitened
-    inputs (`data/README.md`)."""
+    """Iterations of Algorithm 1 (the paper says epochs; one pass over random data has no end). A
+    million of them at 5 x 512 are twice the arithmetic of all updates; 20,000 at 3 x 128 are as exact on
+    whitened inputs (`data/README.md`)."""
     crm_noise: float = 0.1
     """Standard deviation of the noise on the reconstruction model's inputs, in discounted cost."""
     crm_noise_rate: float = 0.0

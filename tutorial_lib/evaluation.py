@@ -153,7 +153,9 @@ def normalised_cost(costs, threshold):
 
 def with_scores(results: pd.DataFrame) -> pd.DataFrame:
     """Raw results with two more columns, `reward_score` and `cost_score`."""
-    parts = [] if len(results) else [results.assign(reward_score=0.0, cost_score=0.0)]
+    if results.empty:
+        return results.assign(reward_score=0.0, cost_score=0.0)
+    parts = []
     for name, part in results.groupby("task", sort=False):
         rewards = normalised_return(part["return"], get_task(name))
         parts.append(
