@@ -269,6 +269,36 @@ def test_an_update_leaves_nothing_behind_but_numbers(name):
         assert not any(value.requires_grad for value in parameters.values())
 
 
+@pytest.mark.parametrize("seeds", [(0,), (0, 1)])
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_in_bfloat16_an_update_is_the_same_to_8_bits_and_leaves_float32(name, seeds):
+    found = {}
+    for precision in ("float32", "bfloat16"):
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(0)  # an untrained reconstruction model draws from it
+            agent = make_agent(name, seeds=seeds, precision=precision)
+        scalars = one_update(agent, random_batch(1, runs=len(seeds)))
+        parameters = [p for group in agent.optimiser.param_groups for p in group["params"]]
+        gradients = [p.grad for p in parameters if p.grad is not None]  # CPQ's push rests at first
+        assert all(x.dtype == torch.float32 for x in gradients)
+        assert all(x.dtype == torch.float32 for x in agent.state().values() if x.is_floating_point())
+        found[precision] = scalars, torch.cat([x.flatten() for x in gradients])
+    (exact, gradient), (rounded, rounded_gradient) = found.values()
+    for key, value in exact.items():
+        if key.endswith("_loss"):
+            assert rounded[key] == pytest.approx(value, rel=0.05, abs=0.02), key
+    assert 1e-4 < (rounded_gradient - gradient).norm() / gradient.norm() < 0.05
+
+
+def test_the_reconstruction_is_trained_in_float32():
+    first, second = (make_agent("C2IQL", precision=precision) for precision in ("float32", "bfloat16"))
+    for agent in (first, second):
+        agent.prepare(toy_dataset(), progress=False)
+    states = (agent.reconstruction.state_dict() for agent in (first, second))
+    for one, other in zip(*(state.values() for state in states), strict=True):
+        assert torch.equal(one, other)
+
+
 # --- What each loss reaches ---
 
 
@@ -449,9 +479,11 @@ def toy_dataset(seed=0, episodes=40):
         {"kappa_2": 0.6},
         {"gamma": 0.7},
         {"target_tau": 0.5},
+        {"precision": "bfloat16"},
     ],
     ids=str,
 )
+@pytest.mark.filterwarnings("ignore:this CPU takes")  # without units for bfloat16
 def test_an_option_changes_what_is_learned(options):
     def last_log(**changes):
         agent = make_agent("C2IQL", **changes)

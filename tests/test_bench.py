@@ -2,6 +2,7 @@
 
 import dataclasses
 import subprocess
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pandas as pd
@@ -139,6 +140,28 @@ def test_time_is_charged_to_the_part_that_took_it(monkeypatch):
     assert found == {"seconds": 28.0} | {part: calls[part] * durations[part] for part in PARTS}
 
 
+def test_on_a_gpu_the_whole_is_timed_without_waiting_within_an_update(monkeypatch):
+    """A clock that only waiting moves, by a second: laps wait five times an update, the whole at its ends."""
+    seconds, updates_made = [0.0], [0]
+    watch = OurUpdates(Case("C2IQL", "CarCircle", "small"))
+    watch.device, watch.now = torch.device("cuda"), lambda: seconds[0]
+
+    def wait(device):
+        seconds[0] += 1
+
+    def update():
+        updates_made[0] += 1
+        return made()
+
+    made, watch._update = watch._update, update
+    monkeypatch.setattr(updates, "_wait_for", wait)
+    monkeypatch.setattr(updates, "clock", lambda device: lambda: seconds[0])
+    found = watch.measure(0)
+    assert updates_made == [2] and sum(found[part] for part in PARTS) > 5
+    assert found["seconds"] == 1
+    assert watch.measure(0) == found  # laps are taken again
+
+
 def test_arithmetic_is_counted_by_hand():
     """A forward product of (B, in) by (in, out) is 2 B in out; its two gradients are as many each."""
     b, width, obs, act, m = 512, 256, 8 + 1, 2, 3
@@ -187,12 +210,26 @@ def test_cases_take_turns_and_the_first_turn_is_not_counted(monkeypatch):
 
 
 def test_every_part_of_an_update_takes_time():
-    table = bench.training(TASKS["BallRun"], [("small", 1), ("small", 2)], rounds=1, seconds=0.02)
+    kinds = ({}, {"runs": 2}, {"products": "bfloat16"})
+    table = bench.training(
+        [Case("C2IQL", "BallRun", "small", **kind) for kind in kinds], rounds=1, seconds=0.02
+    )
+    assert table[["runs", "precision"]].to_numpy().tolist() == [
+        [1, "float32"],
+        [2, "float32"],
+        [1, "bfloat16"],
+    ]
     shares = table[list(PARTS)].to_numpy()
     assert (shares > 0).all() and shares.sum(1) == pytest.approx(1)
     assert table["of_product"].between(0.001, 2).all()
     hours = table["hours"] * table["updates_per_second"] * 3600
-    assert hours.tolist() == pytest.approx([get_profile("small").steps] * 2)
+    assert hours.tolist() == pytest.approx([get_profile("small").steps] * 3)
+
+
+def test_a_case_in_bfloat16_trains_in_bfloat16():
+    for precision in ("float32", "bfloat16", "default"):
+        watch = OurUpdates(Case("BC-All", "BallRun", "small", products=precision))
+        assert watch.agent.config.precision == ("bfloat16" if precision == "bfloat16" else "float32")
 
 
 # --- Peers ---
@@ -321,10 +358,18 @@ def test_tables_by_hand(folder):
 
 
 def test_two_processes_are_compared_by_the_clock(monkeypatch):
+    pools = []
+
+    def threads(count, mp_context):
+        pools.append((count, mp_context.get_start_method()))
+        return ThreadPoolExecutor(count)
+
+    monkeypatch.setattr(cases, "ProcessPoolExecutor", threads)
     monkeypatch.setattr(cases, "_rate", lambda case, seconds: 4.0)
     found = cases.side_by_side(Case("C2IQL", "AntCircle"), 2, rounds=1).assign(group="processes")
     assert found[["processes", "seconds"]].to_numpy().tolist() == [[1, 0.25], [2, 0.125]]
     assert tables.ratios(found, {"processes": 1}, {"processes": 2}).tolist() == [2]
+    assert pools == [(1, "spawn"), (2, "spawn")]  # one alone is not the process that measures
 
 
 def test_what_was_not_measured_is_left_out(folder):

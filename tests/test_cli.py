@@ -291,11 +291,11 @@ def test_bench_prints_both_tables(c2iql, monkeypatch):
     assert status == 0, err
     lines = [line.split() for line in out.splitlines()]
     rows = [line for line in lines if line[:1] == ["small"]]
-    assert [row[1] for row in rows] == ["1", "3"]
+    assert [row[1:3] for row in rows] == [["1", "float32"], ["3", "float32"], ["1", "bfloat16"]]
     for row in rows:
-        shares = [int(cell.rstrip("%")) for cell in row[5:]]
+        shares = [int(cell.rstrip("%")) for cell in row[6:]]
         assert len(shares) == len(bench.PARTS) and 98 <= sum(shares) <= 102
-        assert float(row[2]) > 1
+        assert float(row[3]) > 1
     assert ["bare", "simulator", "1"] in [line[:3] for line in lines]
     assert any(line[:2] == ["rollouts", "1"] and 0 < int(line[3].rstrip("%")) < 200 for line in lines)
 

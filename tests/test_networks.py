@@ -2,13 +2,23 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 from torch import nn
 from torch.func import stack_module_state, vmap
 
 from tutorial_lib.config import Config
-from tutorial_lib.networks import Borrower, Critics, EnsembleLinear, Policy, Value, gaussian_log_prob, mlp
+from tutorial_lib.networks import (
+    Borrower,
+    Critics,
+    EnsembleLinear,
+    Output,
+    Policy,
+    Value,
+    gaussian_log_prob,
+    mlp,
+)
 
 CONFIG = Config(hidden_width=16, hidden_layers=2)
 B, OBS, ACT = 5, 7, 2
@@ -30,7 +40,7 @@ def numbers(module):
 def test_mlp_has_as_many_hidden_layers_as_it_is_asked_for(layers, expected):
     net = mlp(3, 8, layers, 2)
     assert numbers(net) == expected
-    assert [type(m) for m in net] == [nn.Linear, nn.ReLU] * layers + [nn.Linear]
+    assert [type(m) for m in net] == [nn.Linear, nn.ReLU] * layers + [Output]
 
 
 def test_the_papers_networks_have_two_layers_of_256():
@@ -168,3 +178,57 @@ def test_a_borrower_computes_with_what_it_is_lent(runs):
     plain = {key: value[-1] for key, value in parameters.items()}
     torch.testing.assert_close(borrower.lend(plain)(s[0], a[0]), nets[-1](s[0], a[0]))
     assert not list(borrower.module.parameters()) and len(list(nets[0].parameters())) == len(plain)
+
+
+# --- bfloat16 ---
+
+
+def to_bfloat16(x):
+    """To the nearest number with 8 bits, of two equally near ones the even: by the bits of a float32."""
+    bits = np.asarray(x, np.float32).view(np.uint32).astype(np.uint64)
+    bits = (bits + 0x7FFF + (bits >> 16 & 1)) & 0xFFFF0000
+    return bits.astype(np.uint32).view(np.float32).astype(float)
+
+
+def rounded_mlp(x, weights, biases):
+    """Layer by layer with weights (in, out): what hidden layers read and say is rounded."""
+    for weight, bias in zip(weights[:-1], biases[:-1], strict=True):
+        x = to_bfloat16(to_bfloat16(x) @ to_bfloat16(weight) + to_bfloat16(bias)).clip(0)
+    return x @ weights[-1] + biases[-1]
+
+
+def exact_mlp(x, weights, biases):
+    for weight, bias in zip(weights[:-1], biases[:-1], strict=True):
+        x = (x @ weight + bias).clip(0)
+    return x @ weights[-1] + biases[-1]
+
+
+def test_under_autocast_hidden_layers_round_and_outputs_do_not():
+    config = Config(hidden_width=64, hidden_layers=2)
+    s, a = torch.randn(200, OBS), torch.randn(200, ACT)
+    policy, critics = Policy(OBS, ACT, config), Critics(OBS, ACT, config, 1.0)
+    numpy = [p.detach().double().numpy() for p in policy.net.parameters()]
+    cases = [(lambda: policy.net(s), s, [w.T for w in numpy[::2]], numpy[1::2])]
+    numpy = [p.detach().double().numpy() for p in critics.parameters()]
+    pairs = torch.cat([s, a], 1)
+    for k in range(2):
+        one = [w[k] for w in numpy[::2]], [b[k] for b in numpy[1::2]]
+        cases.append((lambda k=k: critics(s, a)[k, :, None] - 1, pairs, *one))
+    for network, inputs, weights, biases in cases:
+        x = inputs.double().numpy()
+        by_hand, exact = rounded_mlp(x, weights, biases), exact_mlp(x, weights, biases)
+        with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
+            found = network()
+        assert found.dtype == torch.float32
+        size = np.abs(by_hand - exact).mean()
+        assert size > 1e-4  # there is something to see
+        assert np.abs(found.numpy() - by_hand).mean() < 0.2 * size  # where sums lie between two numbers
+        with torch.no_grad():
+            np.testing.assert_allclose(network().numpy(), exact, atol=1e-5)
+
+
+def test_a_network_without_hidden_layers_does_not_round():
+    net, x = mlp(OBS, 0, 0, 3), torch.randn(200, OBS)
+    with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
+        found = net(x)
+    assert torch.equal(found, net(x))

@@ -1,11 +1,14 @@
-"""Which library multiplies: the setting comes and goes, and products stay as exact as it says."""
+"""Which library multiplies: the setting comes and goes, and products stay exact."""
+
+import warnings
+from types import SimpleNamespace
 
 import pytest
 import torch
 from torch.backends.mkldnn import matmul
 
 from tutorial_lib import products as module
-from tutorial_lib.products import products
+from tutorial_lib.products import bfloat16_time, products, warn_where_bfloat16_is_slow
 
 KINDS = {  # every kind of product in an update, forward and backward, from factors in [1, 2)
     "mm": lambda a, b: (a[0] @ b[0], a[0].double() @ b[0].double()),
@@ -29,20 +32,12 @@ def test_float32_products_are_exact_to_float32(kind, shape):
     torch.testing.assert_close(found.double(), exact, rtol=1e-5, atol=0)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_bfloat16_products_are_exact_to_8_bits(kind):
-    with products("bfloat16"):
-        found, exact = KINDS[kind](*factors(512, 256, 256))
-    torch.testing.assert_close(found.double(), exact, rtol=2**-8, atol=0)
-
-
-def test_where_products_would_be_rounded_float32_leaves_the_setting_alone(monkeypatch):
+@pytest.mark.parametrize(("exact", "setting"), [(True, "bf16"), (False, None)])
+def test_where_products_would_be_rounded_the_setting_is_left_alone(exact, setting, monkeypatch):
     before = matmul.fp32_precision
-    monkeypatch.setattr(module, "_exact", lambda: False)
-    with products("float32"):
-        assert matmul.fp32_precision == before
-    with products("bfloat16"):
-        assert matmul.fp32_precision == "bf16"
+    monkeypatch.setattr(module, "_exact", lambda: exact)
+    with products():
+        assert matmul.fp32_precision == (setting or before)
     assert matmul.fp32_precision == before
 
 
@@ -64,3 +59,32 @@ def test_the_setting_is_put_back_after_an_error():
     with pytest.raises(ZeroDivisionError), products():
         raise ZeroDivisionError
     assert matmul.fp32_precision == before
+
+
+# --- bfloat16 ---
+
+
+def test_the_time_of_bfloat16_is_a_multiple_of_float32s(monkeypatch):
+    """A clock that only products move: by 3 seconds in bfloat16, by 2 in float32, at first by much more."""
+    seconds, calls = [0.0], []
+
+    def multiply(a, b):
+        calls.append(a.dtype)
+        seconds[0] += (3 if a.dtype == torch.bfloat16 else 2) + (50 if len(calls) < 3 else 0)
+        return a
+
+    monkeypatch.setattr(module, "_exact", lambda: True)
+    monkeypatch.setattr(module, "time", SimpleNamespace(perf_counter=lambda: seconds[0]))
+    monkeypatch.setattr(torch.Tensor, "__matmul__", multiply)
+    assert bfloat16_time(rounds=2) == 1.5
+    assert calls == 3 * [torch.float32, torch.bfloat16]
+
+
+def test_a_cpu_that_emulates_bfloat16_is_warned_of(monkeypatch):
+    monkeypatch.setattr(module, "bfloat16_time", lambda: 7.04)
+    with pytest.warns(UserWarning, match="7.0 times as long .*leave out precision=bfloat16"):
+        warn_where_bfloat16_is_slow()
+    monkeypatch.setattr(module, "bfloat16_time", lambda: 0.5)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warn_where_bfloat16_is_slow()

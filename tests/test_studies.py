@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from scipy import stats
 
 from tutorial_lib import cells as cells_module
 from tutorial_lib import engine, studies, training
@@ -23,7 +24,7 @@ from tutorial_lib.datasets import (
     read_dataset,
     write_dataset,
 )
-from tutorial_lib.evaluation import evaluate
+from tutorial_lib.evaluation import evaluate, with_scores
 from tutorial_lib.studies import Grid, Study
 
 TINY = {
@@ -313,6 +314,20 @@ def test_agents_of_the_small_profile_that_are_shipped_would_be_found(tmp_path):
         assert cell.config == dataclasses.replace(PROFILES["small"], **own.get(cell.task, {}))
         assert cell.threshold is None
         assert find_trained(cell, tmp_path / "runs" / "study") is not None
+
+
+@pytest.mark.parametrize(("score", "most"), [("reward_score", 0.03), ("cost_score", 0.2)])
+@pytest.mark.parametrize("task", ["BallRun", "BallCircle", "CarCircle"])
+def test_returns_and_costs_in_bfloat16_are_those_in_float32(task, score, most):
+    """What `data/README.md` says of the committed study: pairs of seeds, by Student's t."""
+    results = pd.read_csv(SHIPPED_DATA / "results" / "precision.csv")
+    part = with_scores(results[results["task"] == task])
+    limits = part.groupby(["precision", "seed", "threshold"])[score].mean()
+    means = limits.groupby(["precision", "seed"]).mean()
+    pairs = (means["bfloat16"] - means["float32"]).to_numpy()
+    assert len(pairs) == 5 and np.abs(pairs).max() > 0  # not the same agents twice
+    low, high = stats.t.interval(0.95, len(pairs) - 1, pairs.mean(), stats.sem(pairs))
+    assert -most < low < 0 < high < most
 
 
 def test_the_shipped_antcircle_agent_learns_from_the_cheaper_episodes():

@@ -19,7 +19,6 @@ from tutorial_lib import evaluation, studies, training
 from tutorial_lib.algorithms import get_algorithm
 from tutorial_lib.config import Config, get_profile
 from tutorial_lib.datasets import fetch_dataset, load_dataset
-from tutorial_lib.products import Precision
 from tutorial_lib.tasks import TASKS, get_task
 
 Positional = tyro.conf.Positional
@@ -86,7 +85,6 @@ def train(
     data: str = "shipped",
     out: Path | None = None,
     device: Device = "cpu",
-    precision: Precision = "float32",
     option: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE")] = (),
 ) -> None:
     """Train an agent (several seeds together) and save it with its log; resumes a killed run.
@@ -100,7 +98,6 @@ def train(
         data: shipped, dsrl, or a file.
         out: folder of the run; default runs/TASK/ALGORITHM-PROFILE.
         device: cpu or cuda.
-        precision: of matrix products on the CPU; bfloat16 is coarser, and quicker only where there is AMX.
         option: changes to the profile, e.g. kappa_2=0.7 time_limits=mask.
     """
     record, kind = get_task(task), get_algorithm(algorithm)
@@ -115,7 +112,7 @@ def train(
     if any(getattr(config, name) != value for name, value in own.items()):
         words = " ".join(f"{name}={value}" for name, value in own.items())
         print(f"The agents of {record.name} in the results have options of their own: --option {words}")
-    training.train(agent, load_dataset(record, data), run_dir=out, precision=precision)
+    training.train(agent, load_dataset(record, data), run_dir=out)
     training.save_agent(agent, out / "agent.safetensors")
     print(
         f"{out}/agent.safetensors: trained for {agent.updates} updates; its log is {out}/{training.METRICS}"

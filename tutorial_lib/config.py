@@ -91,6 +91,10 @@ class Config:
     The critics are smooth; the step is exact about where cost sets in (a speed, a wall), and of two noisy
     estimates the higher one leaves a margin. Without it agents that move along such a line run on either side
     of it by chance."""
+    precision: Literal["float32", "bfloat16"] = "float32"
+    """What hidden layers multiply in while training. bfloat16 rounds their inputs and weights to 8 bits; on
+    CPUs with AVX512_BF16 or AMX it is quicker (study `precision`; on GPUs not measured). Parameters, outputs,
+    losses and the training of the reconstruction model stay in float32, and so does acting."""
     shift_rewards: bool = False
     """Train on rewards minus their dataset minimum. The zero penalty punishes only where Q_r > 0."""
 

@@ -3,6 +3,7 @@
 import copy
 import functools
 import math
+from collections.abc import Callable
 
 import torch
 from torch import Tensor, nn
@@ -11,13 +12,28 @@ from torch.nn import functional as F
 from tutorial_lib.config import Config
 
 
+def in_float32(function: Callable[[Tensor], Tensor], x: Tensor) -> Tensor:
+    """function(x) in float32, also where `Config.precision` has products rounded to bfloat16."""
+    if not torch.is_autocast_enabled(x.device.type):
+        return function(x)
+    with torch.autocast(x.device.type, enabled=False):
+        return function(x.float())
+
+
+class Output(nn.Linear):
+    """A network's last layer, exact: its values are subtracted and compared, and 8 bits would be too few."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        return in_float32(super().forward, x)
+
+
 def mlp(inputs: int, width: int, layers: int, outputs: int) -> nn.Sequential:
     """`layers` hidden layers of `width` ReLU units, and a linear output."""
     sizes = [inputs] + [width] * layers
     hidden = [
         m for i, o in zip(sizes, sizes[1:], strict=False) for m in (nn.Linear(i, o), nn.ReLU(inplace=True))
     ]
-    return nn.Sequential(*hidden, nn.Linear(sizes[-1], outputs))
+    return nn.Sequential(*hidden, Output(sizes[-1], outputs))
 
 
 def _heads(scale: float | tuple[float, ...]) -> int:
@@ -105,7 +121,7 @@ class Critics(nn.Module):
         x = torch.cat([observations, actions], -1).expand(self.k, -1, -1)
         for layer in self.layers[:-1]:
             x = F.relu(layer(x), inplace=True)
-        return _scaled(self.layers[-1](x), self.scale)
+        return _scaled(in_float32(self.layers[-1], x), self.scale)
 
 
 class Policy(nn.Module):

@@ -1,4 +1,4 @@
-"""Which of PyTorch's two libraries multiplies float32 matrices on the CPU, and how exactly.
+"""Which of PyTorch's two libraries multiplies float32 matrices on the CPU, and whether bfloat16 is quicker.
 
 Its default, Intel's MKL, leaves the AVX-512 units of other makers' processors idle. The other one, oneDNN,
 uses what there is, but is only asked where bfloat16 factors are allowed. On processors with units for these
@@ -6,25 +6,23 @@ uses what there is, but is only asked where bfloat16 factors are allowed. On pro
 """
 
 import contextlib
-from typing import Literal
+import time
+import warnings
 
 import torch
 
-Precision = Literal["float32", "bfloat16"]
-
 
 @contextlib.contextmanager
-def products(precision: Precision = "float32"):
-    """Inside, the CPU multiplies with the quickest library of this precision; other devices are left alone.
+def products():
+    """Inside, the CPU multiplies float32 matrices with the quickest library that keeps all 24 bits.
 
-    float32: every product keeps its 24 bits; only the order of sums may change. bfloat16: factors may be
-    rounded to 8 bits, which is quicker on a CPU with AMX, and the same as float32 on all others.
+    Only the order of sums may change; other devices are left alone.
     """
     matmul = torch.backends.mkldnn.matmul
     before = matmul.fp32_precision
     try:
         matmul.fp32_precision = "bf16"
-        if precision == "float32" and not _exact():
+        if not _exact():
             matmul.fp32_precision = before
         yield
     finally:
@@ -41,3 +39,32 @@ def _exact() -> bool:
         if error.abs().max() > 1e-5:  # bfloat16: about 1e-3
             return False
     return True
+
+
+def bfloat16_time(rounds: int = 5) -> float:
+    """What a product in bfloat16 takes on the CPU, as a multiple of the same one's time in float32.
+
+    About a half with units for it (AVX512_BF16), less with AMX. Without them it is emulated: three to forty
+    times as long.
+    """
+    factor = torch.ones(512, 512)
+    best = dict.fromkeys((torch.float32, torch.bfloat16), float("inf"))
+    with products():
+        for _ in range(rounds + 1):  # in turns; the first wakes the library
+            for dtype in best:
+                a = factor.to(dtype)
+                start = time.perf_counter()
+                a @ a
+                best[dtype] = min(best[dtype], time.perf_counter() - start)
+    return best[torch.bfloat16] / best[torch.float32]
+
+
+def warn_where_bfloat16_is_slow() -> None:
+    """Say what it costs on a CPU that emulates it."""
+    multiple = bfloat16_time()
+    if multiple > 1.2:
+        warnings.warn(
+            f"this CPU takes {multiple:.1f} times as long for a product in bfloat16 as in float32, which it "
+            "emulates: leave out precision=bfloat16",
+            stacklevel=3,
+        )

@@ -13,7 +13,7 @@ from tqdm.auto import trange
 from tutorial_lib.config import Config
 from tutorial_lib.datasets import Dataset
 from tutorial_lib.discounting import cost_sequences, discounted_sums, random_cost_sequences
-from tutorial_lib.networks import mlp
+from tutorial_lib.networks import in_float32, mlp
 from tutorial_lib.tasks import Task
 
 POOL = 60_000
@@ -39,7 +39,8 @@ class CostReconstruction(nn.Module):
         )
 
     def forward(self, discounted: Tensor) -> Tensor:
-        return self.net((discounted - self.mean) @ self.whiten).squeeze(-1) * self.horizon
+        whitened = in_float32(lambda x: (x - self.mean) @ self.whiten, discounted)  # where all digits count
+        return self.net(whitened).squeeze(-1) * self.horizon
 
 
 def episode_sums(dataset: Dataset, task: Task) -> tuple[np.ndarray, np.ndarray]:

@@ -106,6 +106,16 @@ STUDIES: dict[str, Study] = {
         "One cost critic, or the one of two that expects the most cost?",
         (Grid(PAIR, options=({"cost_critics": 1}, {"cost_critics": 2})),),
     ),
+    "precision": Study(
+        "Does it matter that hidden layers multiply in bfloat16?",
+        (
+            Grid(
+                ("BallRun", "BallCircle", "CarCircle"),
+                options=({"precision": "float32"}, {"precision": "bfloat16"}),
+                seeds=5,
+            ),
+        ),
+    ),
     "infinite-at-test": Study(
         "When should the policy be told that nothing limits it any more?",
         (

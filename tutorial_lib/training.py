@@ -17,7 +17,7 @@ from tutorial_lib.algorithms import Agent, get_algorithm
 from tutorial_lib.config import Config
 from tutorial_lib.datasets import Batch, Dataset, sample_batch
 from tutorial_lib.files import written_whole
-from tutorial_lib.products import Precision, products
+from tutorial_lib.products import products, warn_where_bfloat16_is_slow
 from tutorial_lib.tasks import get_task
 
 CHECKPOINT = "checkpoint.safetensors"
@@ -37,15 +37,13 @@ def train(
     checkpoint_every: int = 2_500,
     on_checkpoint: Callable[[Agent], None] | None = None,
     progress: bool = True,
-    precision: Precision = "float32",
 ) -> list[dict]:
     """Train all runs of `agent` until it has made `steps` updates (default: its config's). Returns the log.
 
     With a `run_dir`, scalars go to metrics.csv and everything needed to go on to checkpoint.safetensors,
     every `checkpoint_every` updates; called again on the same folder, it continues from there, bit for bit
     on the same machine. Each run samples with a generator of its own, seeded by its seed, so its batches
-    do not depend on which seeds train beside it. `precision` is that of matrix products on the CPU. Raises
-    TrainingError when a loss is NaN or infinite.
+    do not depend on which seeds train beside it. Raises TrainingError when a loss is NaN or infinite.
     """
     steps = agent.config.steps if steps is None else steps
     generators = [torch.Generator().manual_seed(seed) for seed in agent.seeds]
@@ -55,7 +53,9 @@ def train(
     dataset = agent.select_episodes(dataset)
     if agent.config.shift_rewards:
         dataset = dataclasses.replace(dataset, rewards=dataset.rewards - dataset.rewards.min())
-    with products(precision):
+    if agent.config.precision == "bfloat16" and agent.device.type == "cpu":
+        warn_where_bfloat16_is_slow()
+    with products():
         if not (resumes or agent.updates):
             agent.prepare(dataset, progress)
             if run_dir:  # a reconstruction model can take longer than all updates

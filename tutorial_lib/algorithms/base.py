@@ -174,14 +174,9 @@ class Agent:
         limits = limits.to(self.device, non_blocking=True)  # a GPU is fed, not waited for
         noise = zip(*[self.draw_noise(g, size) for g in generators], strict=True)  # by kind, not by run
         noise = [torch.stack(runs).to(self.device, non_blocking=True) for runs in noise]
-        if len(self.seeds) == 1:  # the same function without the lift, which is not free
-            lent = self.parameters, self.target_parameters
-            squeezed = (_map(p, lambda x: x.squeeze(0)) for p in lent)  # x[0] would have its gradient copied
-            own = Batch(*(x[0] for x in batch)), limits[0], *(x[0] for x in noise)
-            loss, scalars = self._total(*squeezed, *own)
-            scalars = {name: value[None] for name, value in scalars.items()}
-        else:
-            loss, scalars = vmap(self._total)(self.parameters, self.target_parameters, batch, limits, *noise)
+        rounded = self.config.precision == "bfloat16"
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=rounded):
+            loss, scalars = self._lifted(batch, limits, *noise)
         self.optimiser.zero_grad()
         loss.sum().backward()  # runs share no parameter, so each gets its own gradient
         for group in self.optimiser.param_groups:
@@ -265,6 +260,17 @@ class Agent:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             return self.build()
+
+    def _lifted(self, batch: Batch, limits: Tensor, *noise: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        """`_total` of every run: losses (S,), and scalars, each (S,)."""
+        lent = self.parameters, self.target_parameters
+        if len(self.seeds) > 1:
+            return vmap(self._total)(*lent, batch, limits, *noise)
+        # The same function without the lift, which is not free.
+        squeezed = (_map(p, lambda x: x.squeeze(0)) for p in lent)  # x[0] would have its gradient copied
+        own = Batch(*(x[0] for x in batch)), limits[0], *(x[0] for x in noise)
+        loss, scalars = self._total(*squeezed, *own)
+        return loss, {name: value[None] for name, value in scalars.items()}
 
     def _total(
         self, parameters, target_parameters, batch: Batch, limit: Tensor, *noise: Tensor

@@ -5,7 +5,7 @@ how cost grows with seeds, batch and data, in some minutes. Tables and figure of
 """
 
 import platform
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from datetime import date
 from importlib.metadata import version
 from pathlib import Path
@@ -19,10 +19,11 @@ from tqdm.auto import tqdm
 from tutorial_lib.bench.cases import TASKS, groups, measure, side_by_side
 from tutorial_lib.bench.peers import install
 from tutorial_lib.bench.simulation import simulation
-from tutorial_lib.bench.tables import FILES, FOLDER, with_shares
+from tutorial_lib.bench.tables import FILES, FOLDER, part_shares, with_shares
 from tutorial_lib.bench.updates import PARTS, PRODUCT, Case
 from tutorial_lib.config import PROFILES
 from tutorial_lib.files import written_whole
+from tutorial_lib.products import bfloat16_time
 from tutorial_lib.tasks import Task, get_task
 
 __all__ = ["PARTS", "bench", "full", "install", "machine", "training"]
@@ -35,38 +36,36 @@ def bench(
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Both tables, `training` and `simulation`. A measurement of training lasts `seconds` or one update."""
     workers = workers or joblib.cpu_count()  # the cores that this process may use
-    cases = [(profile, runs) for profile in PROFILES for runs in (1, 3)]
+    name, kinds = task.name, ({}, {"runs": 3}, {"products": "bfloat16"})
+    cases = [Case("C2IQL", name, profile, **kind) for profile in PROFILES for kind in kinds]
     with tqdm(total=(rounds + 1) * (len(cases) + 6), desc="measuring", leave=False) as bar:
         return (
-            training(task, cases, rounds, seconds, device, bar.update),
+            training(cases, rounds, seconds, device, bar.update),
             simulation(task, workers, rounds, bar.update),
         )
 
 
 def training(
-    task: Task,
-    cases: list[tuple[str, int]],
+    cases: Sequence[Case],
     rounds: int = 3,
     seconds: float = 0.6,
     device="cpu",
     done: Callable[[], object] = lambda: None,
 ) -> pd.DataFrame:
-    """One row per case (profile, runs trained together): updates per second, each part's share of the time.
+    """One row per case of one task and algorithm: updates per second, each part's share of the time.
 
-    Real updates of C2IQL on random transitions: how long they take does not depend on what they hold.
+    Real updates on random transitions: how long they take does not depend on what they hold.
     `hours` is what the profile's number of updates would take, without its reconstruction model; `of_product`
-    compares the arithmetic per second with that of one large product of matrices.
+    compares the arithmetic per second with that of one large float32 product of matrices.
     """
-    chosen = [Case("C2IQL", task.name, profile, runs) for profile, runs in cases]
-    found = with_shares(measure([Case(PRODUCT, task.name), *chosen], rounds, seconds, device, done))
-    rows = []
-    for (profile, runs), part in found[found["what"] == "C2IQL"].groupby(["profile", "runs"], sort=False):
+    found = with_shares(measure([Case(PRODUCT, cases[0].task), *cases], rounds, seconds, device, done))
+    rows, by = [], ["profile", "products", "runs"]
+    for (profile, precision, runs), part in found[found["what"] != PRODUCT].groupby(by, sort=False):
         speed = 1 / part["seconds"].median()
-        row = {"profile": profile, "runs": runs, "updates_per_second": speed}
+        row = {"profile": profile, "runs": runs, "precision": precision, "updates_per_second": speed}
         row |= {"hours": PROFILES[profile].steps / speed / 3600, "of_product": part["share"].median()}
-        shares = part[list(PARTS)].div(part["seconds"], axis=0).median()
-        rows.append(row | dict(shares / shares.sum()))
-    return pd.DataFrame(rows).sort_values(["profile", "runs"], ignore_index=True)
+        rows.append(row | dict(part_shares(part).median()))
+    return pd.DataFrame(rows)
 
 
 def full(
@@ -87,7 +86,7 @@ def full(
             pd.concat(tables).to_csv(temporary, index=False, float_format="%.6g")
 
     write("machine", [machine(device, busy)])
-    total = (rounds + 1) * sum(map(len, everything.values())) + 10 * len(TASKS)
+    total = (rounds + 1) * sum(map(len, everything.values())) + 5 * (rounds + 1) * len(TASKS)
     with tqdm(total=total, desc="measuring", leave=False) as bar:
         for name, cases in everything.items():
             parts.append(measure(cases, rounds, seconds, device, bar.update, missing).assign(group=name))
@@ -99,8 +98,8 @@ def full(
         else:
             together = side_by_side(Case("C2IQL", TASKS[0]), workers, rounds)
             write("updates", [*parts, together.assign(group="processes")])
-        rollouts = [simulation(get_task(task), workers, 1, bar.update).assign(task=task) for task in TASKS]
-        write("simulation", rollouts)
+        played = {task: simulation(get_task(task), workers, rounds, bar.update) for task in TASKS}
+        write("simulation", [table.assign(task=task) for task, table in played.items()])
     return [folder / file for file in FILES.values()]
 
 
@@ -113,6 +112,7 @@ def machine(device, busy: float) -> pd.DataFrame:
         "processor": names[0] if names else platform.processor() or platform.machine(),
         "cores": joblib.cpu_count(),
         "instructions": torch.backends.cpu.get_cpu_capability(),
+        "a product in bfloat16": f"{bfloat16_time():.2f} of its time in float32",
         "device": torch.cuda.get_device_name() if str(device) == "cuda" else "cpu",
         "threads": torch.get_num_threads(),
         "busy before the start": f"{busy:.0f}%",

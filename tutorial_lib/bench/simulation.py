@@ -7,6 +7,7 @@ from collections.abc import Callable
 import joblib
 import numpy as np
 import pandas as pd
+from joblib.externals.loky import get_reusable_executor
 
 from tutorial_lib import evaluation
 from tutorial_lib.algorithms import get_algorithm
@@ -41,6 +42,7 @@ def simulation(
             steps = case()
             speeds[turn, column] = steps / (time.perf_counter() - started)
             done()
+    get_reusable_executor().shutdown()  # the next task's processes begin without this one's simulators
     rows = []
     for (what, processes), speed in zip(cases, speeds[1:].T, strict=True):
         row = {"what": what, "processes": processes, "steps_per_second": np.median(speed)}

@@ -14,10 +14,12 @@ FOLDER = SHIPPED_DATA / "results" / "bench"
 FILES = {name: f"{name}.csv" for name in ("machine", "updates", "simulation")}
 NOT_RUN = "*Not measured: `c2iql bench --full` does it.*"
 OURS, SMALL = "C2IQL", f"C2IQL, its reconstruction model {SMALL_CRM}"
+ROUNDED, BOTH = "C2IQL in bfloat16", f"C2IQL in bfloat16, its reconstruction model {SMALL_CRM}"
 NAMES = {  # what stands in the table: (what, products, crm)
     "C2IQL": (OURS, "float32", "5 x 512"),
     SMALL: (OURS, "float32", SMALL_CRM),
-    "C2IQL, bfloat16 allowed": (OURS, "bfloat16", "5 x 512"),
+    ROUNDED: (OURS, "bfloat16", "5 x 512"),
+    BOTH: (OURS, "bfloat16", SMALL_CRM),
     "C2IQL, PyTorch's default products": (OURS, "default", "5 x 512"),
     "plain eager C2IQL, our products": (EAGER, "float32", "5 x 512"),
     EAGER: (EAGER, "default", "5 x 512"),
@@ -38,6 +40,12 @@ def with_shares(updates: pd.DataFrame) -> pd.DataFrame:
     product = updates[(updates["what"] == PRODUCT) & (updates["products"] == "float32")]
     rate = (product["flop"] / product["seconds"]).set_axis(product["round"])
     return updates.assign(share=updates["flop"] / updates["seconds"] / updates["round"].map(rate))
+
+
+def part_shares(updates: pd.DataFrame) -> pd.DataFrame:
+    """Each part's share of the parts' sum, row by row."""
+    parts = updates[list(PARTS)]
+    return parts.div(parts.sum(axis=1), axis=0)
 
 
 def seconds(updates: pd.DataFrame, **case) -> pd.Series:
@@ -78,16 +86,20 @@ def yardsticks(updates: pd.DataFrame) -> pd.DataFrame:
 
 def marks(updates: pd.DataFrame) -> pd.DataFrame:
     """What was aimed at, and what was found in one run: ratios, median (lowest to highest) over rounds."""
-    ours, small, plain = case_of(OURS), case_of(SMALL), case_of(EAGER)
+    ours, small, plain, peer = map(case_of, (OURS, SMALL, EAGER, "OSRL's CPQ"))
     aims = {
-        "arithmetic, against that of one large product": (0.8, None),
-        f"x plain eager, with a reconstruction model of {SMALL_CRM}": (2.2, (plain, small)),
-        "x plain eager, with the same model": (None, (plain, ours)),
-        f"x OSRL's CPQ, with a model of {SMALL_CRM}": (10, (case_of("OSRL's CPQ"), small)),
+        "arithmetic, against that of one large product": ("0.8", None),
+        f"x plain eager, with a reconstruction model of {SMALL_CRM}": ("2.2", (plain, small)),
+        "x plain eager, with the same model": ("", (plain, ours)),
+        f"x OSRL's CPQ, with a model of {SMALL_CRM}": ("10", (peer, small)),
+        "x float32, in bfloat16": ("", (ours, case_of(ROUNDED))),
+        "x plain eager, in bfloat16": ("5, with AMX", (plain, case_of(ROUNDED))),
+        f"x plain eager, in bfloat16 with a model of {SMALL_CRM}": ("", (plain, case_of(BOTH))),
+        f"x OSRL's CPQ, in bfloat16 with a model of {SMALL_CRM}": ("", (peer, case_of(BOTH))),
     }
     rows = []
     for aim, (wanted, pair) in aims.items():
-        row = {"mark": aim, "aim": "" if wanted is None else f"{wanted:g}"}
+        row = {"mark": aim, "aim": wanted}
         for task in TASKS:
             part = with_shares(updates[updates["group"] == f"yardsticks {task}"])
             row[task] = _in_words(ratios(part, *pair) if pair else _select(part, ours)["share"])
@@ -117,9 +129,7 @@ def by_algorithm(updates: pd.DataFrame) -> pd.DataFrame:
 def by_part(updates: pd.DataFrame) -> pd.DataFrame:
     """Where an update's time goes: the parts' shares, by profile and number of seeds."""
     part = updates[updates["group"] == "seeds"]
-    shares = (
-        part[list(PARTS)].div(part["seconds"], axis=0).groupby([part["profile"], part["runs"]], sort=False)
-    )
+    shares = part_shares(part).groupby([part["profile"], part["runs"]], sort=False)
     table = shares.median().map("{:.0%}".format).reset_index()
     return table.rename(columns={"runs": "seeds"})
 
