@@ -3,6 +3,7 @@
 Run as a script, this file is the process that gets killed.
 """
 
+import contextlib
 import csv
 import dataclasses
 import json
@@ -24,7 +25,7 @@ from safetensors.torch import save_file
 from tutorial_lib import training
 from tutorial_lib.algorithms import ALGORITHMS, get_algorithm
 from tutorial_lib.config import Config
-from tutorial_lib.datasets import Dataset
+from tutorial_lib.datasets import Dataset, sample_batch
 from tutorial_lib.tasks import TASKS
 from tutorial_lib.training import TrainingError, load_agent, save_agent, train
 
@@ -539,3 +540,54 @@ def test_an_update_moves_every_network_and_targets_follow_by_polyak(name, seeds,
 
 if __name__ == "__main__":
     train_and_die(sys.argv[1], Path(sys.argv[2]))
+
+
+# --- A device that is not the CPU ---
+
+
+@pytest.fixture
+def elsewhere(monkeypatch):
+    """The device 'meta' in a GPU's place: it has no numbers to copy, and hardly mixes with the CPU.
+
+    What PyTorch does not offer there is left out: Adam's fused kernel and autocast.
+    """
+    adam = torch.optim.Adam
+    monkeypatch.setattr(torch.optim, "Adam", lambda groups, fused=None, **options: adam(groups, **options))
+    monkeypatch.setattr(torch, "autocast", lambda *_, **__: contextlib.nullcontext())
+    monkeypatch.setattr(torch, "is_autocast_enabled", lambda device: False)
+    return torch.device("meta")
+
+
+@pytest.mark.parametrize("seeds", [(0,), (0, 1)])
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_updates_stay_on_their_device_and_never_wait_for_a_number(name, seeds, elsewhere, dataset):
+    kind = get_algorithm(name)
+    threshold = 40.0 if kind.constrained and not kind.conditioned else None
+    agent = kind(TASKS["BallRun"], CONFIG, seeds=seeds, threshold=threshold, device=elsewhere)
+    part = agent.select_episodes(dataset)
+    agent.prepare(part, progress=False)
+    data = training._training_data(part, agent)
+    generators = [torch.Generator().manual_seed(seed) for seed in seeds]
+    for _ in range(3):
+        scalars = agent.update(sample_batch(data, 16, generators), generators)
+    assert agent.updates == 3
+    for key, value in (agent.state() | scalars).items():
+        assert key == "updates" or key.endswith(".step") or value.device == elsewhere, key
+
+
+def test_a_number_that_is_asked_for_or_a_mixed_device_is_noticed(elsewhere, dataset):
+    """What the test above would see: the two mistakes, made on purpose."""
+    agent = get_algorithm("C2IQL")(TASKS["BallRun"], CONFIG, device=elsewhere)
+    data, generators = training._training_data(dataset, agent), [torch.Generator()]
+    encode = agent.network_input
+
+    def asks(observations, limit):
+        assert limit.mean().item() > 0
+        return encode(observations, limit)
+
+    agent.network_input = asks
+    with pytest.raises(RuntimeError, match="item"):
+        agent.update(sample_batch(data, 16, generators), generators)
+    agent.network_input, agent.gammas = encode, torch.tensor(agent.cost_gammas)
+    with pytest.raises(RuntimeError, match="device"):
+        agent.update(sample_batch(data, 16, generators), generators)
