@@ -348,6 +348,11 @@ def test_tables_by_hand(folder):
 
     assert tables.by_algorithm(found).shape == (len(ALGORITHMS), 5)
     assert set(tables.by_part(found)["sampling"]) == {"20%"}
+    precisions, begin = tables.by_precision(found), before["precision"] + 1
+    assert precisions["x float32"].tolist() == [
+        alike(i / (i + 1)) for i in range(begin, begin + 2 * len(precisions), 2)
+    ]
+    assert precisions["float32"].iloc[0] == f"{1000 / begin:.1f}"
     grown = tables.growth(found)
     sizes, tasks = (grown[(grown["what grows"] == "tasks") == which] for which in (False, True))
     assert sizes["growth"].str.startswith(("10 x as many", "8 x", "100 x")).all()

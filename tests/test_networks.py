@@ -227,6 +227,22 @@ def test_under_autocast_hidden_layers_round_and_outputs_do_not():
             np.testing.assert_allclose(network().numpy(), exact, atol=1e-5)
 
 
+def test_under_autocast_the_lift_adds_biases_in_float32():
+    config = Config(hidden_width=64, hidden_layers=1)
+    nets, s = [Policy(OBS, ACT, config) for _ in range(2)], torch.randn(200, OBS)
+    parameters, _ = stack_module_state(nets)
+    borrower = Borrower(nets[0])
+    with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
+        found = vmap(lambda p: borrower.lend(p).net(s))(parameters)
+    for net, actual in zip(nets, found, strict=True):
+        w1, b1, w2, b2 = (p.detach().double().numpy() for p in net.net.parameters())
+        products = to_bfloat16(to_bfloat16(s.double().numpy()) @ to_bfloat16(w1.T))
+        np.testing.assert_allclose(actual.numpy(), (products + b1).clip(0) @ w2.T + b2, atol=2e-3)
+        exact = exact_mlp(s.double().numpy(), (w1.T, w2.T), (b1, b2))
+        by_hand = (products + b1).clip(0) @ w2.T + b2
+        assert np.abs(actual.numpy() - by_hand).mean() < 0.1 * np.abs(actual.numpy() - exact).mean()
+
+
 def test_a_network_without_hidden_layers_does_not_round():
     net, x = mlp(OBS, 0, 0, 3), torch.randn(200, OBS)
     with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):

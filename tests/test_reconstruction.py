@@ -288,3 +288,15 @@ def test_the_error_counts_the_noise_of_the_inputs(dataset):
         for noise in (0.0, 4.0)
     )
     assert noisy**2 - silent**2 == pytest.approx(16 * (9 + 4 + 1), rel=0.15)
+
+
+@pytest.mark.parametrize("config", [SMALL, LINEAR], ids=["mlp", "linear"])
+def test_under_autocast_only_hidden_layers_round(config, dataset):
+    model = train_reconstruction(TASK, config, dataset, progress=False)
+    x = torch.as_tensor(episode_sums(dataset, TASK)[0]).float()
+    with torch.no_grad():
+        whitened = (x - model.mean) @ model.whiten
+        with torch.autocast("cpu", torch.bfloat16):
+            found, expected = model(x), model.net(whitened).squeeze(-1) * model.horizon
+        assert found.dtype == torch.float32 and torch.equal(found, expected)
+        assert torch.equal(found, model(x)) == (config == LINEAR)

@@ -22,7 +22,7 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import save_file
 
-from tutorial_lib import training
+from tutorial_lib import products, training
 from tutorial_lib.algorithms import ALGORITHMS, get_algorithm
 from tutorial_lib.config import Config
 from tutorial_lib.datasets import Dataset, sample_batch
@@ -538,10 +538,6 @@ def test_an_update_moves_every_network_and_targets_follow_by_polyak(name, seeds,
     assert targets == expected.get(name, {"critics", "cost_critics"})
 
 
-if __name__ == "__main__":
-    train_and_die(sys.argv[1], Path(sys.argv[2]))
-
-
 # --- A device that is not the CPU ---
 
 
@@ -591,3 +587,27 @@ def test_a_number_that_is_asked_for_or_a_mixed_device_is_noticed(elsewhere, data
     agent.network_input, agent.gammas = encode, torch.tensor(agent.cost_gammas)
     with pytest.raises(RuntimeError, match="device"):
         agent.update(sample_batch(data, 16, generators), generators)
+
+
+# --- Precision ---
+
+
+@pytest.mark.parametrize(("precision", "warned"), [("bfloat16", True), ("float32", False)])
+def test_training_where_bfloat16_is_emulated_says_so(precision, warned, dataset, monkeypatch):
+    monkeypatch.setattr(products, "bfloat16_time", lambda: 7.0)
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        train(make_agent(precision=precision), dataset, steps=1, progress=False)
+    assert any("7.0 times as long" in str(warning.message) for warning in found) == warned
+
+
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_acting_does_not_round(name, dataset):
+    agents = [make_agent(name, precision=precision) for precision in ("float32", "bfloat16")]
+    observations, limits = dataset.observations[:50], np.full(50, 40.0)
+    actions = [agent.act(observations, limits) for agent in agents]
+    assert np.array_equal(*actions)
+
+
+if __name__ == "__main__":
+    train_and_die(sys.argv[1], Path(sys.argv[2]))

@@ -92,9 +92,10 @@ class Config:
     estimates the higher one leaves a margin. Without it agents that move along such a line run on either side
     of it by chance."""
     precision: Literal["float32", "bfloat16"] = "float32"
-    """What hidden layers multiply in while training. bfloat16 rounds their inputs and weights to 8 bits; on
-    CPUs with AVX512_BF16 or AMX it is quicker (study `precision`; on GPUs not measured). Parameters, outputs,
-    losses and the training of the reconstruction model stay in float32, and so does acting."""
+    """What hidden layers multiply in while training. bfloat16 rounds what they read, say and send back to 8
+    bits; outputs, losses, parameters, Adam, the reconstruction model's training and acting stay in float32.
+    Quicker in profile `paper` on a CPU with AVX512_BF16; with AMX or on a GPU never run. Several seeds
+    together add biases in float32, so one seed alone differs from them by a rounding."""
     shift_rewards: bool = False
     """Train on rewards minus their dataset minimum. The zero penalty punishes only where Q_r > 0."""
 

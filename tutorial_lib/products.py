@@ -44,8 +44,7 @@ def _exact() -> bool:
 def bfloat16_time(rounds: int = 5) -> float:
     """What a product in bfloat16 takes on the CPU, as a multiple of the same one's time in float32.
 
-    About a half with units for it (AVX512_BF16), less with AMX. Without them it is emulated: three to forty
-    times as long.
+    About a half with AVX512_BF16. Without such units it is emulated: three to forty times as long.
     """
     factor = torch.ones(512, 512)
     best = dict.fromkeys((torch.float32, torch.bfloat16), float("inf"))

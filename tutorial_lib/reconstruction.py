@@ -13,7 +13,7 @@ from tqdm.auto import trange
 from tutorial_lib.config import Config
 from tutorial_lib.datasets import Dataset
 from tutorial_lib.discounting import cost_sequences, discounted_sums, random_cost_sequences
-from tutorial_lib.networks import in_float32, mlp
+from tutorial_lib.networks import Output, in_float32, mlp
 from tutorial_lib.tasks import Task
 
 POOL = 60_000
@@ -34,9 +34,7 @@ class CostReconstruction(nn.Module):
         self.horizon = task.horizon
         self.register_buffer("mean", torch.zeros(m))
         self.register_buffer("whiten", torch.eye(m))
-        self.net = (
-            nn.Linear(m, 1) if config.crm == "linear" else mlp(m, config.crm_width, config.crm_layers, 1)
-        )
+        self.net = Output(m, 1) if config.crm == "linear" else mlp(m, config.crm_width, config.crm_layers, 1)
 
     def forward(self, discounted: Tensor) -> Tensor:
         whitened = in_float32(lambda x: (x - self.mean) @ self.whiten, discounted)  # where all digits count

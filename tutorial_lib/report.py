@@ -196,7 +196,7 @@ def speed_text() -> str:
     updates, simulation, machine = (tables.load(name) for name in ("updates", "simulation", "machine"))
     if updates is None:
         return tables.NOT_RUN
-    made = (tables.yardsticks, tables.by_algorithm, tables.by_part, tables.growth)
+    made = (tables.yardsticks, tables.by_algorithm, tables.by_precision, tables.by_part, tables.growth)
     parts = [tables.circumstances(machine), "![speed](results/bench/speed.png)"]
     parts += [markdown(table(updates)) for table in made]
     played = "*Rollouts: not measured.*" if simulation is None else markdown(tables.rollouts(simulation))

@@ -108,12 +108,13 @@ STUDIES: dict[str, Study] = {
     ),
     "precision": Study(
         "Does it matter that hidden layers multiply in bfloat16?",
-        (
+        tuple(
             Grid(
-                ("BallRun", "BallCircle", "CarCircle"),
-                options=({"precision": "float32"}, {"precision": "bfloat16"}),
+                (task,),
+                options=tuple(OWN_OPTIONS.get(task, {}) | {"precision": p} for p in ("float32", "bfloat16")),
                 seeds=5,
-            ),
+            )
+            for task in ("BallRun", "BallCircle", "CarCircle", "AntCircle")
         ),
     ),
     "infinite-at-test": Study(

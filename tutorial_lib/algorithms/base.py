@@ -266,7 +266,7 @@ class Agent:
         lent = self.parameters, self.target_parameters
         if len(self.seeds) > 1:
             return vmap(self._total)(*lent, batch, limits, *noise)
-        # The same function without the lift, which is not free.
+        # Without the lift, which is not free.
         squeezed = (_map(p, lambda x: x.squeeze(0)) for p in lent)  # x[0] would have its gradient copied
         own = Batch(*(x[0] for x in batch)), limits[0], *(x[0] for x in noise)
         loss, scalars = self._total(*squeezed, *own)

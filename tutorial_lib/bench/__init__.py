@@ -34,7 +34,10 @@ BUSY = 10
 def bench(
     task: Task, workers: int | None = None, rounds: int = 3, seconds: float = 0.6, device="cpu"
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Both tables, `training` and `simulation`. A measurement of training lasts `seconds` or one update."""
+    """Both tables, `training` and `simulation`.
+
+    A measurement of training lasts `seconds` or one update, on a GPU twice that.
+    """
     workers = workers or joblib.cpu_count()  # the cores that this process may use
     name, kinds = task.name, ({}, {"runs": 3}, {"products": "bfloat16"})
     cases = [Case("C2IQL", name, profile, **kind) for profile in PROFILES for kind in kinds]
@@ -112,7 +115,7 @@ def machine(device, busy: float) -> pd.DataFrame:
         "processor": names[0] if names else platform.processor() or platform.machine(),
         "cores": joblib.cpu_count(),
         "instructions": torch.backends.cpu.get_cpu_capability(),
-        "a product in bfloat16": f"{bfloat16_time():.2f} of its time in float32",
+        "a product in bfloat16 on the CPU": f"{bfloat16_time():.2f} of its time in float32",
         "device": torch.cuda.get_device_name() if str(device) == "cuda" else "cpu",
         "threads": torch.get_num_threads(),
         "busy before the start": f"{busy:.0f}%",

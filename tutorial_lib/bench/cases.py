@@ -45,6 +45,12 @@ def groups() -> dict[str, list[Case]]:
         "algorithms": [
             Case(name, task, profile) for profile in PROFILES for task in TASKS for name in ALGORITHMS
         ],
+        "precision": [
+            Case("C2IQL", ant, profile, runs, products=precision)
+            for profile in PROFILES
+            for runs in (1, 5)
+            for precision in ("float32", "bfloat16")
+        ],
         "seeds": [Case("C2IQL", ant, profile, runs) for profile in PROFILES for runs in (1, 2, 5, 10)],
         "batch": [Case("C2IQL", ant, batch=batch) for batch in (128, 256, 512, 1024)],
         "rows": [Case("C2IQL", ant, rows=rows) for rows in (10_000, 100_000, 1_000_000)],
@@ -69,7 +75,8 @@ def measure(
 ) -> pd.DataFrame:
     """One row per case and round: the case, the round, FLOP and seconds per update, and of each part.
 
-    A measurement lasts `seconds` or one update. What cannot be measured is left out, and `missing` told why.
+    A measurement lasts `seconds` or one update, on a GPU twice that. What cannot be measured is left out, and
+    `missing` told why.
     """
     watches = {}
     for case in cases:

@@ -92,7 +92,6 @@ def marks(updates: pd.DataFrame) -> pd.DataFrame:
         f"x plain eager, with a reconstruction model of {SMALL_CRM}": ("2.2", (plain, small)),
         "x plain eager, with the same model": ("", (plain, ours)),
         f"x OSRL's CPQ, with a model of {SMALL_CRM}": ("10", (peer, small)),
-        "x float32, in bfloat16": ("", (ours, case_of(ROUNDED))),
         "x plain eager, in bfloat16": ("5, with AMX", (plain, case_of(ROUNDED))),
         f"x plain eager, in bfloat16 with a model of {SMALL_CRM}": ("", (plain, case_of(BOTH))),
         f"x OSRL's CPQ, in bfloat16 with a model of {SMALL_CRM}": ("", (peer, case_of(BOTH))),
@@ -124,6 +123,18 @@ def by_algorithm(updates: pd.DataFrame) -> pd.DataFrame:
     table = speed.unstack(["profile", "task"])
     table.columns = [f"`{profile}`, {task}" for profile, task in table.columns]
     return table.map("{:.1f}".format).rename_axis("updates/s").reset_index()
+
+
+def by_precision(updates: pd.DataFrame) -> pd.DataFrame:
+    """Updates per second in either precision, by profile and number of seeds, and the ratio by round."""
+    rows = []
+    part = updates[updates["group"] == "precision"]
+    for (profile, runs), own in part.groupby(["profile", "runs"], sort=False):
+        slow, fast = ({"products": precision} for precision in ("float32", "bfloat16"))
+        speeds = (f"{1 / seconds(own, **case).median():.1f}" for case in (slow, fast))
+        row = {"updates/s": profile, "seeds": runs} | dict(zip(("float32", "bfloat16"), speeds, strict=True))
+        rows.append(row | {"x float32": _in_words(ratios(own, slow, fast))})
+    return pd.DataFrame(rows)
 
 
 def by_part(updates: pd.DataFrame) -> pd.DataFrame:
