@@ -37,7 +37,7 @@ class Recipe:
     """How one task's data is collected."""
 
     episodes: int
-    """About how many episodes the dataset keeps: DSRL's number, or what 15 to 20 MB hold."""
+    """About how many episodes the dataset keeps: DSRL's number, or what 14 to 18 MB hold."""
     return_cells: int = 20
     """Episodes of like cost are thinned evenly over so many cells of return. 1: by chance, so that experts
     are as frequent as in the run; where one episode in forty is kept, they would be too few otherwise."""

@@ -47,8 +47,8 @@ class Config:
     crm_layers: int = 5
     crm_steps: int = 1_000_000
     """Iterations of Algorithm 1 (the paper says epochs; one pass over random data has no end). A
-    million of them at 5 x 512 are twice the arithmetic of all updates; 20,000 at 3 x 128 are as exact on
-    whitened inputs (`data/README.md`)."""
+    million of them at 5 x 512 are twice the arithmetic of all updates; on whitened inputs 20,000 at 3 x 128
+    do (`data/README.md`, "Profile `paper`")."""
     crm_noise: float = 0.1
     """Standard deviation of the noise on the reconstruction model's inputs, in discounted cost."""
     crm_noise_rate: float = 0.0
@@ -134,7 +134,7 @@ PROFILES: dict[str, Config] = {"paper": Config()}
 PROFILES["small"] = dataclasses.replace(
     PROFILES["paper"],
     profile="small",
-    # A laptop's size: a quarter of the arithmetic per transition, half the batch, one update in 33.
+    # A laptop's size: a seventh of the arithmetic per transition, half the batch, one update in 33.
     batch_size=256,
     hidden_width=128,
     crm_width=64,

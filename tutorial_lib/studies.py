@@ -55,18 +55,17 @@ OWN_OPTIONS = {
     "DroneCircle": {"cost_critics": 1},
     "AntCircle": {"unsafe_price": 200.0, "crm_noise_rate": 0.05},
 }
-"""What a task changes in the profile. DroneRun's agents stayed below the speed limit whatever they might
-spend, at a normalised reward of 0.61 under a limit of 110; with masked time limits they have 0.70. One
+"""What a task changes in the profile. DroneRun's agents stayed near the many that never exceed the speed
+limit, at a normalised reward of 0.61 under a limit of 110; with masked time limits they have 0.70. One
 action of an ant's gait hardly shows in its cost: at profile `small`'s price of 6 an agent paid 43 under
 AntRun's limit of 30, and 98 under AntCircle's of 40. On AntCircle the critics' heads differ mostly by error,
 and a reconstruction model that is told so (with the price, five seeds) made that 55. On DroneCircle the
 highest of two cost critics expects 52, 59 and 69 under the three limits, and 5, 9 and 11 are paid (study
-ablations); one alone expects 20, 29 and 34, and 22, 32 and 36 are paid, for 0.05 more
-of normalised reward."""
+ablations); one alone expects 20, 29 and 34, and 22, 32 and 36 are paid, for 0.05 more of reward."""
 
 SLOW_TARGETS = {"target_tau": 0.01}
-"""For an actor that asks about its own actions: on BallCircle at 50, CPQ (seed 0) had a normalised reward and
-cost of 0.57 / 0.96 with it, and 0.26 / 0.49 with profile `small`'s 0.1."""
+"""For an actor that asks about its own actions: on BallCircle at 50, CPQ had a normalised reward and
+cost of 0.57 / 0.96 with it, and 0.26 / 0.49 with profile `small`'s 0.1 (seed 0 alone, not kept)."""
 
 STUDIES: dict[str, Study] = {
     "table1": Study(

@@ -4,8 +4,8 @@ The backup of CPQ asks the critics about actions of the policy, recorded or not.
 VAE of the recorded actions tells which of them lie outside the data, and the cost critics are pushed to find
 these too costly. In the benchmark's code (OSRL, `cpq.py`), whose results papers compare with, that push sits
 inside `no_grad`, on the target networks: it trains nothing. `CPQ` is what that code trains, `PushedCPQ` what
-was published. On BallCircle at a limit of 50 (`small`, target_tau=0.01, seed 0) they have a normalised reward
-and cost of 0.57 / 0.96 and 0.02 / 0.97, so the tables have the first.
+was published. On BallCircle at a limit of 50 (`small`, target_tau=0.01, a trial of seed 0 alone) they had a
+normalised reward and cost of 0.57 / 0.96 and 0.02 / 0.97, so the tables have the first.
 
 Settings are OSRL's. Where we depart, or settle what is open:
 
