@@ -185,38 +185,32 @@ def test_a_borrower_computes_with_what_it_is_lent(runs):
 
 def to_bfloat16(x):
     """To the nearest number with 8 bits, of two equally near ones the even: by the bits of a float32."""
-    bits = np.asarray(x, np.float32).view(np.uint32).astype(np.uint64)
+    bits = x.numpy().astype(np.float32).view(np.uint32).astype(np.uint64)
     bits = (bits + 0x7FFF + (bits >> 16 & 1)) & 0xFFFF0000
-    return bits.astype(np.uint32).view(np.float32).astype(float)
+    return torch.from_numpy(bits.astype(np.uint32).view(np.float32).astype(float))
 
 
 def rounded_mlp(x, weights, biases):
-    """Layer by layer with weights (in, out): what hidden layers read and say is rounded."""
+    """`relu_mlp` where all that hidden layers read and say is rounded."""
     for weight, bias in zip(weights[:-1], biases[:-1], strict=True):
-        x = to_bfloat16(to_bfloat16(x) @ to_bfloat16(weight) + to_bfloat16(bias)).clip(0)
-    return x @ weights[-1] + biases[-1]
-
-
-def exact_mlp(x, weights, biases):
-    for weight, bias in zip(weights[:-1], biases[:-1], strict=True):
-        x = (x @ weight + bias).clip(0)
-    return x @ weights[-1] + biases[-1]
+        x = to_bfloat16(to_bfloat16(x) @ to_bfloat16(weight).T + to_bfloat16(bias)).clamp(min=0)
+    return x @ weights[-1].T + biases[-1]
 
 
 def test_under_autocast_hidden_layers_round_and_outputs_do_not():
     config = Config(hidden_width=64, hidden_layers=2)
     s, a = torch.randn(200, OBS), torch.randn(200, ACT)
     policy, critics = Policy(OBS, ACT, config), Critics(OBS, ACT, config, 1.0)
-    numpy = [p.detach().double().numpy() for p in policy.net.parameters()]
-    cases = [(lambda: policy.net(s), s, [w.T for w in numpy[::2]], numpy[1::2])]
-    numpy = [p.detach().double().numpy() for p in critics.parameters()]
+    doubles = [p.detach().double() for p in policy.net.parameters()]
+    cases = [(lambda: policy.net(s), s, doubles[::2], doubles[1::2])]
+    doubles = [p.detach().double() for p in critics.parameters()]
     pairs = torch.cat([s, a], 1)
     for k in range(2):
-        one = [w[k] for w in numpy[::2]], [b[k] for b in numpy[1::2]]
+        one = [w[k].T for w in doubles[::2]], [b[k] for b in doubles[1::2]]
         cases.append((lambda k=k: critics(s, a)[k, :, None] - 1, pairs, *one))
     for network, inputs, weights, biases in cases:
-        x = inputs.double().numpy()
-        by_hand, exact = rounded_mlp(x, weights, biases), exact_mlp(x, weights, biases)
+        x = inputs.double()
+        by_hand, exact = (f(x, weights, biases).numpy() for f in (rounded_mlp, relu_mlp))
         with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
             found = network()
         assert found.dtype == torch.float32
@@ -235,11 +229,11 @@ def test_under_autocast_the_lift_adds_biases_in_float32():
     with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
         found = vmap(lambda p: borrower.lend(p).net(s))(parameters)
     for net, actual in zip(nets, found, strict=True):
-        w1, b1, w2, b2 = (p.detach().double().numpy() for p in net.net.parameters())
-        products = to_bfloat16(to_bfloat16(s.double().numpy()) @ to_bfloat16(w1.T))
-        np.testing.assert_allclose(actual.numpy(), (products + b1).clip(0) @ w2.T + b2, atol=2e-3)
-        exact = exact_mlp(s.double().numpy(), (w1.T, w2.T), (b1, b2))
-        by_hand = (products + b1).clip(0) @ w2.T + b2
+        w1, b1, w2, b2 = (p.detach().double() for p in net.net.parameters())
+        products = to_bfloat16(to_bfloat16(s) @ to_bfloat16(w1).T)
+        by_hand = ((products + b1).clamp(min=0) @ w2.T + b2).numpy()
+        np.testing.assert_allclose(actual.numpy(), by_hand, atol=2e-3)
+        exact = relu_mlp(s.double(), (w1, w2), (b1, b2)).numpy()
         assert np.abs(actual.numpy() - by_hand).mean() < 0.1 * np.abs(actual.numpy() - exact).mean()
 
 

@@ -69,11 +69,11 @@ def make_dataset():
     )
 
 
-def make_agent(name="IQL", seeds=(0,), task="BallRun", threshold=40.0, **changes):
+def make_agent(name="IQL", seeds=(0,), task="BallRun", threshold=40.0, device="cpu", **changes):
     kind = get_algorithm(name)
     fixed = kind.constrained and not kind.conditioned
     config = dataclasses.replace(CONFIG, **changes)
-    return kind(TASKS[task], config, seeds=seeds, threshold=threshold if fixed else None)
+    return kind(TASKS[task], config, seeds, threshold=threshold if fixed else None, device=device)
 
 
 @pytest.fixture(scope="module")
@@ -557,9 +557,7 @@ def elsewhere(monkeypatch):
 @pytest.mark.parametrize("seeds", [(0,), (0, 1)])
 @pytest.mark.parametrize("name", ALGORITHMS)
 def test_updates_stay_on_their_device_and_never_wait_for_a_number(name, seeds, elsewhere, dataset):
-    kind = get_algorithm(name)
-    threshold = 40.0 if kind.constrained and not kind.conditioned else None
-    agent = kind(TASKS["BallRun"], CONFIG, seeds=seeds, threshold=threshold, device=elsewhere)
+    agent = make_agent(name, seeds, device=elsewhere)
     part = agent.select_episodes(dataset)
     agent.prepare(part, progress=False)
     data = training._training_data(part, agent)
@@ -573,7 +571,7 @@ def test_updates_stay_on_their_device_and_never_wait_for_a_number(name, seeds, e
 
 def test_a_number_that_is_asked_for_or_a_mixed_device_is_noticed(elsewhere, dataset):
     """What the test above would see: the two mistakes, made on purpose."""
-    agent = get_algorithm("C2IQL")(TASKS["BallRun"], CONFIG, device=elsewhere)
+    agent = make_agent("C2IQL", device=elsewhere)
     data, generators = training._training_data(dataset, agent), [torch.Generator()]
     encode = agent.network_input
 

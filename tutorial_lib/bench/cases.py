@@ -106,10 +106,10 @@ def side_by_side(case: Case, most: int, rounds: int = 3, seconds: float = 2.0) -
         pools = {n: stack.enter_context(ProcessPoolExecutor(n, mp_context=fresh)) for n in (1, most)}
         for turn in range(rounds + 1):
             for count, pool in pools.items():
-                rates = pool.map(_rate, [case] * count, [seconds if turn else 0] * count)
-                row = asdict(case) | {"batch": case.config.batch_size, "processes": count, "round": turn}
-                row |= {"seconds": 1 / sum(rates)}
-                rows += [row] if turn else []
+                together = sum(pool.map(_rate, [case] * count, [seconds if turn else 0] * count))
+                if turn:
+                    row = asdict(case) | {"batch": case.config.batch_size, "processes": count, "round": turn}
+                    rows.append(row | {"seconds": 1 / together})
     return pd.DataFrame(rows)
 
 
