@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from tutorial_lib.datasets import Batch
+from tutorial_lib.data.dataset import Batch
 
 OBS, ACT = 3, 2
 """Dimensions of the observations and actions of these tests' small task."""

@@ -14,9 +14,9 @@ import torch
 from randoms import random_batch, randomise
 from torch.func import functional_call
 
-from tutorial_lib.algorithms import ALGORITHMS, get_algorithm
+from tutorial_lib.agents import ALGORITHMS, get_algorithm
 from tutorial_lib.config import Config, get_profile
-from tutorial_lib.datasets import Batch, Dataset
+from tutorial_lib.data.dataset import Batch, Dataset
 from tutorial_lib.tasks import TASKS
 from tutorial_lib.training import train
 

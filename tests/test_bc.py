@@ -7,12 +7,13 @@ import pytest
 import torch
 from torch.func import functional_call
 
-from tutorial_lib.algorithms import get_algorithm
+from tutorial_lib.agents import get_algorithm
+from tutorial_lib.checkpoints import load_agent, save_agent
 from tutorial_lib.config import get_profile
-from tutorial_lib.datasets import Batch, Dataset, DatasetError
-from tutorial_lib.evaluation import evaluate
+from tutorial_lib.data.dataset import Batch, Dataset, DatasetError
+from tutorial_lib.playing import evaluate
 from tutorial_lib.tasks import get_task
-from tutorial_lib.training import load_agent, save_agent, train
+from tutorial_lib.training import train
 
 TASK = get_task("BallRun")
 CONFIG = dataclasses.replace(

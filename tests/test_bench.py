@@ -10,14 +10,17 @@ import psutil
 import pytest
 import torch
 
-from tutorial_lib import bench, plotting, report
-from tutorial_lib.algorithms import ALGORITHMS, get_algorithm
-from tutorial_lib.bench import cases, peers, tables, updates
-from tutorial_lib.bench.eager import EagerC2IQL
-from tutorial_lib.bench.updates import EAGER, PARTS, PRODUCT, Case, OurUpdates, random_transitions
+import benchmarks
+from benchmarks import cases, peers, tables, updates
+from benchmarks.eager import EagerC2IQL
+from benchmarks.updates import EAGER, PARTS, PRODUCT, Case, OurUpdates, random_transitions
+from tutorial_lib.__main__ import bench
+from tutorial_lib.agents import ALGORITHMS, get_algorithm
 from tutorial_lib.config import get_profile
-from tutorial_lib.datasets import Batch
-from tutorial_lib.products import products
+from tutorial_lib.course import figures
+from tutorial_lib.data.dataset import Batch
+from tutorial_lib.matmul import products
+from tutorial_lib.studies import report
 from tutorial_lib.tasks import TASKS
 
 SMALL = {
@@ -211,7 +214,7 @@ def test_cases_take_turns_and_the_first_turn_is_not_counted(monkeypatch):
 
 def test_every_part_of_an_update_takes_time():
     kinds = ({}, {"runs": 2}, {"products": "bfloat16"})
-    table = bench.training(
+    table = benchmarks.training(
         [Case("C2IQL", "BallRun", "small", **kind) for kind in kinds], rounds=1, seconds=0.02
     )
     assert table[["runs", "precision"]].to_numpy().tolist() == [
@@ -316,7 +319,7 @@ def folder(tmp_path, monkeypatch):
     monkeypatch.setattr(bench, "simulation", lambda *_: one)
     monkeypatch.setattr(psutil, "cpu_percent", lambda interval: 30.0)
     said = []
-    bench.full(tmp_path, workers=2, rounds=2, missing=said.append)
+    benchmarks.full(tmp_path, workers=2, rounds=2, missing=said.append)
     assert said == ["2 processes at once: not measured, others take 30% of the cores"]
     return tmp_path
 
@@ -386,14 +389,14 @@ def test_what_was_not_measured_is_left_out(folder):
     assert rows.loc["OSRL's CPQ", "AntCircle: updates/s"] == "not measured"
     marks = tables.marks(found).set_index("mark")
     assert set(marks.filter(like="OSRL", axis=0)["AntCircle"]) == {"not measured"}
-    labels = [label.get_text() for label in plotting.speed(found).axes[0].get_yticklabels()]
+    labels = [label.get_text() for label in figures.speed(found).axes[0].get_yticklabels()]
     assert "C2IQL" in labels and "OSRL's CPQ" not in labels
 
 
 def test_the_pages_show_the_files_or_say_that_there_are_none(folder, monkeypatch):
     monkeypatch.setattr(tables, "FOLDER", folder)
     assert report.write_speed() == folder / "speed.png"
-    figure = plotting.speed(tables.load("updates", folder))
+    figure = figures.speed(tables.load("updates", folder))
     bars = [bar.get_width() for bar in figure.axes[0].patches]
     assert len(bars) == len(tables.NAMES) and max(bars) == pytest.approx(1000 / 3)
     assert "| C2IQL | " in report.speed_text() and "cost of five seeds" in report.speed_front()

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from tutorial_lib import checks
+from tutorial_lib.course import checks
 from tutorial_lib.tasks import get_task
 
 NOTEBOOKS = Path(__file__).parents[1] / "notebooks"

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from tutorial_lib import checks, widgets
+from tutorial_lib.course import checks, widgets
 
 
 def paired_interval(first, second):

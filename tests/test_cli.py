@@ -12,11 +12,14 @@ import numpy as np
 import pandas as pd
 import pytest
 
+import benchmarks
 from tutorial_lib import __main__ as cli
-from tutorial_lib import bench
-from tutorial_lib.datasets import Dataset, write_dataset
+from tutorial_lib.__main__ import bench
+from tutorial_lib.checkpoints import load_agent
+from tutorial_lib.data.dataset import Dataset
+from tutorial_lib.data.hdf5 import write_dataset
+from tutorial_lib.studies import cluster
 from tutorial_lib.tasks import TASKS
-from tutorial_lib.training import load_agent
 
 ROOT = Path(__file__).parents[1]
 TINY = ["hidden_width=8", "hidden_layers=1", "batch_size=8", "crm_width=8", "crm_layers=1", "crm_steps=5"]
@@ -230,14 +233,14 @@ def test_train_says_what_the_results_agents_have_that_this_one_has_not(c2iql, da
 @pytest.fixture
 def small_study(monkeypatch):
     """A study of the shipped data that takes a second."""
-    from tutorial_lib import studies
+    from tutorial_lib.studies import grids
 
-    grid = studies.Grid(("BallRun",), options=({"kappa_1": 0.6},), seeds=1, limits=(25.0,))
-    monkeypatch.setitem(studies.STUDIES, "quick", studies.Study("How quick?", (grid,)))
+    grid = grids.Grid(("BallRun",), options=({"kappa_1": 0.6},), seeds=1, limits=(25.0,))
+    monkeypatch.setitem(grids.STUDIES, "quick", grids.Study("How quick?", (grid,)))
 
 
 def test_report_of_a_study_says_that_it_was_not_run(c2iql, monkeypatch):
-    from tutorial_lib import report, results
+    from tutorial_lib.studies import report, results
 
     monkeypatch.setattr(report, "load_results", lambda name: results.load_results("no-such-study"))
     status, out, _ = c2iql("report", "kappas")
@@ -262,12 +265,12 @@ def test_study(c2iql, tmp_path, small_study):
 
 
 def test_a_failed_cell_is_reported_and_the_others_are_kept(c2iql, tmp_path, data, monkeypatch):
-    from tutorial_lib import engine, studies
+    from tutorial_lib.studies import grids
 
-    grid = studies.Grid(("BallRun",), ("BC-All", "BC-Safe"), seeds=1)
-    monkeypatch.setitem(studies.STUDIES, "cloning", studies.Study("Who copies whom?", (grid,)))
-    monkeypatch.setattr(engine, "run_cells", lambda chosen, *_: {chosen[0].name: "DatasetError: none"})
-    monkeypatch.setattr(engine, "connect", lambda *_: contextlib.nullcontext())
+    grid = grids.Grid(("BallRun",), ("BC-All", "BC-Safe"), seeds=1)
+    monkeypatch.setitem(grids.STUDIES, "cloning", grids.Study("Who copies whom?", (grid,)))
+    monkeypatch.setattr(cluster, "run_cells", lambda chosen, *_: {chosen[0].name: "DatasetError: none"})
+    monkeypatch.setattr(cluster, "connect", lambda *_: contextlib.nullcontext())
     out_file = tmp_path / "out.csv"
     arguments = ["study", "cloning", "--data", data, "--runs", tmp_path, "--out", out_file]
     status, out, err = c2iql(*arguments)
@@ -286,7 +289,7 @@ def test_a_folder_that_cannot_be_written_is_one_line_of_error(c2iql, data, tmp_p
 def test_bench_prints_both_tables(c2iql, monkeypatch):
     tiny = cli.with_options(cli.get_profile("small"), tuple(TINY))
     monkeypatch.setattr(bench, "PROFILES", {"small": tiny})
-    monkeypatch.setattr(bench.updates, "get_profile", lambda name: tiny)
+    monkeypatch.setattr(benchmarks.updates, "get_profile", lambda name: tiny)
     status, out, err = c2iql("bench", "--task", "BallRun", "--rounds", 1, "--workers", 1)
     assert status == 0, err
     lines = [line.split() for line in out.splitlines()]
@@ -294,7 +297,7 @@ def test_bench_prints_both_tables(c2iql, monkeypatch):
     assert [row[1:3] for row in rows] == [["1", "float32"], ["3", "float32"], ["1", "bfloat16"]]
     for row in rows:
         shares = [int(cell.rstrip("%")) for cell in row[6:]]
-        assert len(shares) == len(bench.PARTS) and 98 <= sum(shares) <= 102
+        assert len(shares) == len(benchmarks.PARTS) and 98 <= sum(shares) <= 102
         assert float(row[3]) > 1
     assert ["bare", "simulator", "1"] in [line[:3] for line in lines]
     assert any(line[:2] == ["rollouts", "1"] and 0 < int(line[3].rstrip("%")) < 200 for line in lines)

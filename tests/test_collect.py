@@ -18,9 +18,9 @@ import numpy as np
 import pytest
 from safetensors.numpy import load_file
 
-from tutorial_lib import collect as collecting
-from tutorial_lib.collect import RECIPES, PricedCost, Recipe, along_own_axes, run_ppo, thin
-from tutorial_lib.datasets import read_dataset
+from tutorial_lib.data import collect as collecting
+from tutorial_lib.data.collect import RECIPES, PricedCost, Recipe, along_own_axes, run_ppo, thin
+from tutorial_lib.data.hdf5 import read_dataset
 from tutorial_lib.tasks import TASKS
 
 ROOT = Path(__file__).parents[1]

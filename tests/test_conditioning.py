@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from tutorial_lib.conditioning import (
+from tutorial_lib.costs.conditioning import (
     check_threshold,
     encode,
     nearest_threshold,

@@ -11,9 +11,10 @@ from randoms import random_batch, randomise
 from torch.func import functional_call
 
 from tutorial_lib import training
-from tutorial_lib.algorithms.cpq import CPQ, PushedCPQ, latent_divergences
+from tutorial_lib.agents.cpq import CPQ, PushedCPQ
 from tutorial_lib.config import Config
-from tutorial_lib.datasets import Batch, Dataset
+from tutorial_lib.course.maximisation_bias import latent_divergences
+from tutorial_lib.data.dataset import Batch, Dataset
 from tutorial_lib.tasks import TASKS
 
 T, B, OBS, ACT = 10, 8, 3, 2

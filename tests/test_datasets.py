@@ -20,8 +20,9 @@ import pooch
 import pytest
 import torch
 
-from tutorial_lib import datasets
-from tutorial_lib.datasets import Dataset, DatasetError, read_dataset, write_dataset
+from tutorial_lib.data import sources
+from tutorial_lib.data.dataset import KEYS, Dataset, DatasetError
+from tutorial_lib.data.hdf5 import read_dataset, write_dataset
 from tutorial_lib.tasks import TASKS
 
 CAR_RUN = TASKS["CarRun"]
@@ -148,20 +149,20 @@ def test_tensors_hold_the_arrays_and_are_a_copy(dataset, arrays):
 
 def test_sampled_rows_belong_together_and_are_uniform(dataset):
     data = dataset.tensors()._replace(rewards=torch.arange(20.0))  # a reward now names its row
-    batch = datasets.sample_batch(data, 20_000, [torch.Generator().manual_seed(seed) for seed in (0, 1)])
+    batch = dataset.sample_batch(data, 20_000, [torch.Generator().manual_seed(seed) for seed in (0, 1)])
     rows = batch.rewards.long()
     for values, all_values in zip(batch, data, strict=True):
         assert torch.equal(values, all_values[rows])
     for run in rows:
         counts = torch.bincount(run, minlength=20)
         assert counts.min() > 850 and counts.max() < 1150  # 1000 expected, standard deviation 31
-    alone = datasets.sample_batch(data, 20_000, [torch.Generator().manual_seed(1)])
+    alone = dataset.sample_batch(data, 20_000, [torch.Generator().manual_seed(1)])
     assert torch.equal(alone.rewards[0], batch.rewards[1])  # a run's batches do not depend on its neighbours
 
 
 def test_sampling_depends_on_the_generator_alone(dataset):
     data = dataset.tensors()
-    draw = lambda seed: datasets.sample_batch(data, 8, [torch.Generator().manual_seed(seed)])  # noqa: E731
+    draw = lambda seed: dataset.sample_batch(data, 8, [torch.Generator().manual_seed(seed)])  # noqa: E731
     torch.manual_seed(1)
     first = draw(0)
     torch.manual_seed(2)
@@ -371,7 +372,7 @@ def test_another_tasks_file_is_refused_also_where_its_shapes_fit(tmp_path, array
     with pytest.raises(DatasetError, match="its name: CarRun, not BallRun"):
         read_dataset(named, "BallRun")
     with h5py.File(theirs, "w") as file:
-        for key in datasets.KEYS:
+        for key in KEYS:
             width = {"observations": (7,), "next_observations": (7,), "actions": (2,)}.get(key, ())
             file[key] = np.zeros((200, *width), np.float32)
         file["timeouts"][-1] = 1
@@ -388,7 +389,7 @@ def places(tmp_path, monkeypatch):
     """(the shipped data's folder, DSRL's folder), both empty."""
     shipped, dsrl = tmp_path / "data", tmp_path / "dsrl"
     shipped.mkdir(), dsrl.mkdir()
-    monkeypatch.setattr(datasets, "SHIPPED_DATA", shipped)
+    monkeypatch.setattr(sources, "SHIPPED_DATA", shipped)
     monkeypatch.setenv("DSRL_DATASET_DIR", str(dsrl))
     return shipped, dsrl
 
@@ -398,7 +399,7 @@ def test_each_source_is_its_own_and_shipped_is_the_default(places, dataset, tmp_
     write_dataset(shipped / "CarRun.hdf5", dataset.select([0]), "CarRun")
     write_dataset(dsrl / "SafetyCarRun-v0-40-651.hdf5", dataset.select([0, 1]), "CarRun")
     elsewhere = write_dataset(tmp_path / "mine.hdf5", dataset.select([0, 1, 2]), "CarRun")
-    load = lambda *source: datasets.load_dataset("CarRun", *source).num_episodes  # noqa: E731
+    load = lambda *source: sources.load_dataset("CarRun", *source).num_episodes  # noqa: E731
     assert [load(), load("shipped"), load("dsrl"), load(elsewhere), load(str(elsewhere))] == [1, 1, 2, 3, 3]
 
 
@@ -412,19 +413,19 @@ def test_no_source_stands_in_for_another(places, dataset, tmp_path):
         ("CarRun", tmp_path / "absent.hdf5", tmp_path / "absent.hdf5"),
     ):
         with refused(f"^{looked}: .*c2iql fetch {task}`"):
-            datasets.find_dataset(task, source)
+            sources.find_dataset(task, source)
 
 
 def test_dsrl_keeps_its_files_under_home_unless_told_otherwise(monkeypatch, tmp_path):
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.delenv("DSRL_DATASET_DIR", raising=False)
-    assert datasets.dsrl_directory() == tmp_path / ".dsrl" / "datasets"
+    assert sources.dsrl_directory() == tmp_path / ".dsrl" / "datasets"
     monkeypatch.setenv("DSRL_DATASET_DIR", "~/elsewhere")
-    assert datasets.dsrl_directory() == tmp_path / "elsewhere"
+    assert sources.dsrl_directory() == tmp_path / "elsewhere"
 
 
 def test_the_shipped_data_lie_beside_the_package():
-    assert datasets.SHIPPED_DATA.parent.joinpath("tutorial_lib", "datasets.py").is_file()
+    assert sources.SHIPPED_DATA.parent.joinpath("tutorial_lib", "config.py").is_file()
 
 
 # --- Fetching ---
@@ -470,7 +471,7 @@ def server(tmp_path_factory, dataset, monkeypatch):
 
 
 def fetch(server, directory, task="CarRun"):
-    return datasets.fetch_dataset(task, directory, server.url)
+    return sources.fetch_dataset(task, directory, server.url)
 
 
 @pytest.mark.parametrize("breaks", [0, 1, 2])
@@ -486,8 +487,8 @@ def test_fetch_survives_broken_connections(server, tmp_path, capsys, breaks):
 
 
 def test_fetch_goes_to_dsrls_folder_and_its_file_is_found(server, places, dataset):
-    assert datasets.fetch_dataset("CarRun", base_url=server.url).parent == places[1]
-    assert datasets.load_dataset("CarRun", "dsrl").num_episodes == dataset.num_episodes
+    assert sources.fetch_dataset("CarRun", base_url=server.url).parent == places[1]
+    assert sources.load_dataset("CarRun", "dsrl").num_episodes == dataset.num_episodes
 
 
 @pytest.mark.skipif(not shutil.which("sha256sum"), reason="needs sha256sum")
@@ -589,14 +590,14 @@ def test_a_full_disk(server, tmp_path, monkeypatch):
 
 def test_a_checksum_is_of_the_values_and_not_of_the_file(arrays, tmp_path):
     digest = hashlib.sha256()
-    for key in datasets.KEYS:
+    for key in KEYS:
         digest.update(arrays[key].tobytes())
     plain = h5_file(tmp_path / "plain.hdf5", arrays)
     packed = write_dataset(tmp_path / "packed.hdf5", Dataset(**arrays), CAR_RUN, {"seed": 4})
     assert plain.read_bytes() != packed.read_bytes()
     assert read_dataset(plain, CAR_RUN).checksum == read_dataset(packed, CAR_RUN).checksum
     assert read_dataset(plain, CAR_RUN).checksum == digest.hexdigest()
-    for key in datasets.KEYS:
+    for key in KEYS:
         changed = arrays | {key: arrays[key].copy()}
         changed[key][0] = 1 - changed[key][0] if changed[key].dtype != bool else ~changed[key][0]
         assert Dataset(**changed).checksum != digest.hexdigest(), key

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from tutorial_lib.datasets import Dataset
-from tutorial_lib.discounting import (
+from tutorial_lib.costs.discounting import (
     average_threshold,
     cost_sequences,
     discounted_sums,
@@ -16,6 +15,7 @@ from tutorial_lib.discounting import (
     random_cost_sequences,
     settled_share,
 )
+from tutorial_lib.data.dataset import Dataset
 
 KINDS = ("uniform", "block", "beta")
 

@@ -6,7 +6,7 @@ import matplotlib
 import numpy as np
 import pytest
 
-from tutorial_lib import checks, plotting, widgets
+from tutorial_lib.course import checks, figures, widgets
 
 
 @pytest.fixture(autouse=True)
@@ -92,7 +92,7 @@ def test_wrong_extremes_are_told(mistake, capsys):
 
 def test_timelines_show_every_unsafe_step_and_both_ratios():
     costs = np.array([[1, 0, 1, 0], [0, 0, 0, 1.0]])
-    steps, bars = plotting.timelines(costs, gamma=0.5, limit=1).axes[:2]
+    steps, bars = figures.timelines(costs, gamma=0.5, limit=1).axes[:2]
     drawn = [patch for patch in steps.patches if patch.get_width() == 1]
     assert [patch.get_x() for patch in drawn] == [0, 2, 3]
     assert drawn[0].get_facecolor()[3] > drawn[1].get_facecolor()[3] > drawn[2].get_facecolor()[3]
@@ -102,10 +102,10 @@ def test_timelines_show_every_unsafe_step_and_both_ratios():
 
 @pytest.mark.parametrize("gamma", [0.9, 0.99])
 def test_falling_cost_marks_the_starts_at_which_the_discounted_limit_is_wrong(gamma):
-    axes = plotting.falling_cost(gamma, 30).axes
+    axes = figures.falling_cost(gamma, 30).axes
     lines = {line.get_label(): line for line in axes[1].lines}
     mark = sum(gamma**t * 50 / 301 for t in range(301))
-    for length, label in ((40, plotting.FALSE_POSITIVE), (60, plotting.FALSE_NEGATIVE)):
+    for length, label in ((40, figures.FALSE_POSITIVE), (60, figures.FALSE_NEGATIVE)):
         wrong = np.isfinite(lines[label].get_ydata())
         for start in range(0, 301 - length + 1, 7):
             rejected = sum(gamma**t for t in range(start, start + length)) > mark
@@ -114,30 +114,30 @@ def test_falling_cost_marks_the_starts_at_which_the_discounted_limit_is_wrong(ga
 
 def test_mismatch_counts_and_colours_what_it_misjudges():
     cost, estimate = np.array([1, 4, 6, 9.0]), np.array([1, 5, 2, 9.0])
-    figure = plotting.mismatch({"first": (cost, estimate, 5, 4), "second": (cost, cost, 5, 5)})
+    figure = figures.mismatch({"first": (cost, estimate, 5, 4), "second": (cost, cost, 5, 5)})
     first, second = figure.axes
     assert [text.get_text() for text in first.texts] == ["25.0%", "25.0%"]
     assert [text.get_text() for text in second.texts] == ["0.0%", "0.0%"]
     at = {line.get_color(): line.get_xdata() for line in first.lines if len(line.get_xdata()) == 1}
-    assert at[plotting.REWARD] == [4] and at[plotting.COST] == [6]
+    assert at[figures.REWARD] == [4] and at[figures.COST] == [6]
 
 
 def test_misjudged_shares_stand_side_by_side_in_percent():
     counts = {"BallRun": {30: (0.1, 0.2), 50: (0.0, 0.3)}, "CarRun": {10: (0.4, 0.5)}}
-    ball, car = plotting.misjudged_shares(counts).axes
+    ball, car = figures.misjudged_shares(counts).axes
     assert [patch.get_height() for patch in ball.patches] == pytest.approx([10, 0, 20, 30])
     assert [patch.get_height() for patch in car.patches] == pytest.approx([40, 50])
     assert [label.get_text() for label in ball.get_xticklabels()] == ["30", "50"]
 
 
 def test_eight_tasks_have_two_lines_of_panels():
-    figure = plotting.misjudged_shares({f"task {i}": {30: (0.1, 0.2)} for i in range(5)})
+    figure = figures.misjudged_shares({f"task {i}": {30: (0.1, 0.2)} for i in range(5)})
     assert len(figure.axes) == 8 and sum(ax.get_visible() for ax in figure.axes) == 5
 
 
 def test_long_memory_has_a_line_per_name_and_a_dot_per_mark():
     gammas = np.array([0.9, 0.99, 0.999])
-    figure = plotting.long_memory(gammas, {"a": [0.3, 0.2, 0.1]}, [1e3, 1e4, 1e5], marked=(0.99,))
+    figure = figures.long_memory(gammas, {"a": [0.3, 0.2, 0.1]}, [1e3, 1e4, 1e5], marked=(0.99,))
     left, right = figure.axes
     np.testing.assert_allclose(left.lines[0].get_ydata(), [30, 20, 10])
     np.testing.assert_allclose(left.lines[0].get_xdata(), [10, 100, 1000])

@@ -12,8 +12,7 @@ import pytest
 from packaging.requirements import Requirement
 from packaging.version import Version
 
-from tutorial_lib.envs import make_env
-from tutorial_lib.tasks import TASKS
+from tutorial_lib.tasks import TASKS, make_env
 
 ROOT = Path(__file__).parents[1]
 needs_venv = pytest.mark.skipif(

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from tutorial_lib.envs import BulletTask, make_env
-from tutorial_lib.tasks import TASKS
+from tutorial_lib.tasks import TASKS, make_env
+from tutorial_lib.tasks.bullet import BulletTask
 
 ROOT = Path(__file__).parents[1]
 BALLS = ("BallRun", "BallCircle")

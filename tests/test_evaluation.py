@@ -9,20 +9,11 @@ import pandas as pd
 import pytest
 import torch
 
-from tutorial_lib.algorithms import get_algorithm
+from tutorial_lib.agents import get_algorithm
 from tutorial_lib.config import Config
-from tutorial_lib.envs import make_env
-from tutorial_lib.evaluation import (
-    EPISODES_TOGETHER,
-    evaluate,
-    normalised_cost,
-    normalised_return,
-    rollout,
-    save_results,
-    summarise,
-    with_scores,
-)
-from tutorial_lib.tasks import TASKS
+from tutorial_lib.playing import EPISODES_TOGETHER, evaluate, rollout
+from tutorial_lib.scores import normalised_cost, normalised_return, save_results, summarise, with_scores
+from tutorial_lib.tasks import TASKS, make_env
 
 CONFIG = Config(profile="test", hidden_width=16, hidden_layers=1, crm_width=8, crm_layers=1)
 COLUMNS = "task algorithm profile seed threshold episode return cost length".split()

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 import torch
 
-from tutorial_lib import heads
-from tutorial_lib.algorithms import C2IQL
+from tutorial_lib.agents import C2IQL
 from tutorial_lib.config import Config
-from tutorial_lib.datasets import load_dataset
-from tutorial_lib.reconstruction import CostReconstruction
+from tutorial_lib.costs.reconstruction import CostReconstruction
+from tutorial_lib.course import undiscounting
+from tutorial_lib.data.sources import load_dataset
 from tutorial_lib.tasks import TASKS, get_task
 
 TASK = dataclasses.replace(TASKS["BallRun"], horizon=12, gammas=(0.7, 0.8, 0.9))
@@ -27,7 +27,7 @@ def test_no_nearby_weights_are_flatter(name):
             total += (sum(w * g**t for w, g in zip(weights, task.gammas, strict=True)) - 1) ** 2
         return total
 
-    weights = heads.flat_weights(task.gammas, task.horizon)
+    weights = undiscounting.flat_weights(task.gammas, task.horizon)
     best = unevenness(weights)
     for i, step in itertools.product(range(3), (-0.05, 0.05)):
         assert unevenness(weights + step * (np.arange(3) == i)) > best
@@ -36,13 +36,13 @@ def test_no_nearby_weights_are_flatter(name):
 def test_one_head_has_a_closed_form_and_as_many_heads_as_steps_are_exact():
     powers = [0.9**t for t in range(10)]
     weight = sum(powers) / sum(p * p for p in powers)
-    assert heads.flat_weights([0.9], 10) == pytest.approx([weight])
-    weights = heads.flat_weights([0.3, 0.6, 0.9], 3)
+    assert undiscounting.flat_weights([0.9], 10) == pytest.approx([weight])
+    weights = undiscounting.flat_weights([0.3, 0.6, 0.9], 3)
     assert [sum(weights * np.array([0.3, 0.6, 0.9]) ** t) for t in range(3)] == pytest.approx([1, 1, 1])
 
 
 def test_the_weight_curve_is_its_loop():
-    curve = heads.weight_curve([2.0, -1.0], [0.5, 0.9], 6)
+    curve = undiscounting.weight_curve([2.0, -1.0], [0.5, 0.9], 6)
     assert curve == pytest.approx([2 * 0.5**t - 0.9**t for t in range(6)])
 
 
@@ -52,22 +52,22 @@ def test_linear_weights_are_the_models_slopes():
     model.whiten.copy_(torch.tensor([[1.0, 2.0, 0.0], [0.0, 3.0, 1.0], [0.5, 0.0, 4.0]]))
     with torch.no_grad():
         slopes = [(model(2 * row) - model(0 * row)).item() / 2 for row in torch.eye(3)]
-    assert heads.linear_weights(model) == pytest.approx(slopes, rel=1e-4)
+    assert undiscounting.linear_weights(model) == pytest.approx(slopes, rel=1e-4)
     with pytest.raises(ValueError, match="linear"):
-        heads.linear_weights(CostReconstruction(TASK, Config(crm_width=4, crm_layers=1)))
+        undiscounting.linear_weights(CostReconstruction(TASK, Config(crm_width=4, crm_layers=1)))
 
 
 def test_steady_heads_are_sums_over_the_steps_that_each_treatment_sees():
     def loop(steps):
         return [sum(g**t * 6 / 12 for t in range(steps)) for g in TASK.gammas]
 
-    assert heads.steady_heads(TASK, 6, "rate") == pytest.approx(loop(12))
-    assert heads.steady_heads(TASK, 6, "rate", step=5) == pytest.approx(loop(12))
-    assert heads.steady_heads(TASK, 6, "bootstrap") == pytest.approx(loop(1000))
+    assert undiscounting.steady_heads(TASK, 6, "rate") == pytest.approx(loop(12))
+    assert undiscounting.steady_heads(TASK, 6, "rate", step=5) == pytest.approx(loop(12))
+    assert undiscounting.steady_heads(TASK, 6, "bootstrap") == pytest.approx(loop(1000))
     for step in (0, 5, 11):
-        assert heads.steady_heads(TASK, 6, "mask", step) == pytest.approx(loop(12 - step))
+        assert undiscounting.steady_heads(TASK, 6, "mask", step) == pytest.approx(loop(12 - step))
     with pytest.raises(ValueError, match="'clip'.*bootstrap, rate, mask"):
-        heads.steady_heads(TASK, 6, "clip")
+        undiscounting.steady_heads(TASK, 6, "clip")
 
 
 @pytest.mark.parametrize("time_limits", ["rate", "bootstrap"])
@@ -75,10 +75,10 @@ def test_critic_heads_are_what_the_reconstruction_is_given(time_limits):
     """By the agent's own path: a reconstruction that hands its inputs through."""
     config = dataclasses.replace(Config(), time_limits=time_limits, hidden_width=8, crm_width=4, crm_layers=1)
     agent, data = C2IQL(get_task("BallRun"), config), load_dataset("BallRun")
-    found = heads.critic_heads(agent, data, n=7, seed=3)
+    found = undiscounting.critic_heads(agent, data, n=7, seed=3)
     rows = np.random.default_rng(3).choice(len(data), 7, replace=False)
     given = []
-    agent.reconstruction.forward = lambda heads: given.append(heads) or heads.sum(-1)
+    agent.reconstruction.forward = lambda heads: given.append(heads) or undiscounting.sum(-1)
     s = agent.network_input(torch.tensor(data.observations[rows]), torch.full((7,), 50.0))
     agent.episode_cost(agent.network("cost_critics")(s, torch.tensor(data.actions[rows])))
     np.testing.assert_allclose(found, given[0][0].numpy(), rtol=1e-4)
@@ -98,7 +98,7 @@ def test_with_one_head_the_bounds_fill_the_steps_from_either_end(discounted):
             left, total = left - here * 0.9**t, total + here
         return total
 
-    found = heads.cost_bounds([discounted], [0.9], 12)
+    found = undiscounting.cost_bounds([discounted], [0.9], 12)
     assert found == pytest.approx((fill(range(12)), fill(reversed(range(12)))), abs=1e-6)
 
 
@@ -110,23 +110,25 @@ def test_the_truth_lies_within_bounds_that_shrink_with_each_head_to_the_truth():
         sums = np.array([sum(g**t * costs[t] for t in range(4)) for g in gammas])
         widths = []
         for m in range(1, 5):
-            low, high = heads.cost_bounds(sums[:m], gammas[:m], 4)
+            low, high = undiscounting.cost_bounds(sums[:m], gammas[:m], 4)
             assert low - 1e-5 <= costs.sum() <= high + 1e-5
             widths.append(high - low)
         assert all(np.diff(widths) < 1e-5) and widths[0] > 0.1 and widths[-1] < 1e-4
 
 
 def test_heads_that_no_sequence_has_have_no_bounds():
-    assert np.isnan(heads.cost_bounds([-0.1], [0.9], 12)).all()
-    assert np.isnan(heads.cost_bounds([7.3], [0.9], 12)).all()  # 12 unsafe steps: 7.18
-    assert np.isnan(heads.cost_bounds([3.0, 2.0], [0.8, 0.9], 12)).all()  # the longer memory sees more
-    assert np.isfinite(heads.cost_bounds([2.0, 3.0], [0.8, 0.9], 12)).all()
+    assert np.isnan(undiscounting.cost_bounds([-0.1], [0.9], 12)).all()
+    assert np.isnan(undiscounting.cost_bounds([7.3], [0.9], 12)).all()  # 12 unsafe steps: 7.18
+    assert np.isnan(
+        undiscounting.cost_bounds([3.0, 2.0], [0.8, 0.9], 12)
+    ).all()  # the longer memory sees more
+    assert np.isfinite(undiscounting.cost_bounds([2.0, 3.0], [0.8, 0.9], 12)).all()
 
 
 def test_what_one_head_can_be_is_where_the_bounds_of_the_cost_end():
-    sums = heads.steady_heads(TASK, 6)
-    low, high = heads.head_bounds(sums, 1, TASK.gammas, 12)
+    sums = undiscounting.steady_heads(TASK, 6)
+    low, high = undiscounting.head_bounds(sums, 1, TASK.gammas, 12)
     assert low < sums[1] < high
     for value, possible in ((low - 1e-3, 0), (low + 1e-3, 1), (high - 1e-3, 1), (high + 1e-3, 0)):
         moved = np.array([sums[0], value, sums[2]])
-        assert np.isfinite(heads.cost_bounds(moved, TASK.gammas, 12)).all() == possible
+        assert np.isfinite(undiscounting.cost_bounds(moved, TASK.gammas, 12)).all() == possible

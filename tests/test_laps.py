@@ -6,9 +6,9 @@ import math
 import numpy as np
 import pytest
 
-from tutorial_lib import laps, plotting, tabular, widgets
 from tutorial_lib.config import get_profile
-from tutorial_lib.tabular.cmdp import draw
+from tutorial_lib.course import figures, laps, tabular, widgets
+from tutorial_lib.course.tabular.cmdp import draw
 
 CONFIG = dataclasses.replace(get_profile("paper"), infinite_at_test="never")
 
@@ -97,12 +97,12 @@ def test_the_slider_draws_another_limit():
 
 def test_the_figures_show_every_curve_and_every_panel():
     told = laps.told(CONFIG, 20)
-    maps = plotting.budget_maps({"one": (told, None), "two": (told, np.eye(101))}, (20, 20))
+    maps = figures.budget_maps({"one": (told, None), "two": (told, np.eye(101))}, (20, 20))
     assert [ax.get_title() for ax in maps.axes] == ["one", "two"]
     assert [text.get_text() for text in maps.legends[0].get_texts()][-3:] == ["told 10", "told 25", "told 40"]
     line = np.arange(3.0)
     pairs = {name: (line, line + n) for n, name in enumerate("abc")}
-    curves = plotting.against_optimum(line, pairs, (1,))
+    curves = figures.against_optimum(line, pairs, (1,))
     assert [drawn.get_label() for drawn in curves.axes[0].lines][:3] == ["a", "b", "c"]
-    agents = plotting.with_and_without_rule(line, {"thrifty": (line, line), "spendthrift": (line, line)})
+    agents = figures.with_and_without_rule(line, {"thrifty": (line, line), "spendthrift": (line, line)})
     assert [ax.get_title() for ax in agents.axes] == ["thrifty", "spendthrift"]

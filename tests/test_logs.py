@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 from scipy.optimize import linprog
 
-from tutorial_lib import checks, logs, plotting, widgets
-from tutorial_lib.datasets import Dataset
-from tutorial_lib.envs import make_env
-from tutorial_lib.tasks import get_task
+from tutorial_lib.course import checks, figures, widgets
+from tutorial_lib.data import recordings
+from tutorial_lib.data.dataset import Dataset, returns_to_go
+from tutorial_lib.tasks import get_task, make_env
 
 
 @pytest.fixture(autouse=True)
@@ -16,7 +16,7 @@ def without_a_screen():
     matplotlib.use("Agg")
 
 
-def recordings(rng, episodes=30, terminals=True):
+def random_recordings(rng, episodes=30, terminals=True):
     """Random episodes of 1 to 9 steps; some end by a fall."""
     lengths = rng.integers(1, 10, episodes)
     rows = lengths.sum()
@@ -46,23 +46,23 @@ def test_positions_are_the_simulators(name):
         observation, *_ = env.step(np.full(env.task.act_dim, 0.7))
     flag = np.ones(1, bool)
     data = Dataset(last[None], observation[None], np.zeros((1, 2)), flag * 1.0, flag * 1.0, ~flag, flag)
-    assert logs.positions(data)[0] == pytest.approx(env.position, abs=1e-4)
+    assert recordings.positions(data)[0] == pytest.approx(env.position, abs=1e-4)
     start = Dataset(first[None], last[None], np.zeros((1, 2)), flag * 1.0, flag * 1.0, ~flag, flag)
-    assert logs.positions(start, after=False)[0] == pytest.approx(before, abs=1e-4)
+    assert recordings.positions(start, after=False)[0] == pytest.approx(before, abs=1e-4)
     env.close()
 
 
 def test_best_left_against_a_filter_for_each_limit():
-    data = recordings(np.random.default_rng(0))
+    data = random_recordings(np.random.default_rng(0))
     limits = [0, 1, 2.5, 9]
-    shares, best = logs.best_left(data, limits)
+    shares, best = recordings.best_left(data, limits)
     for limit, share, top in zip(limits, shares, best, strict=True):
         kept = [r for r, c in zip(data.episode_returns, data.episode_costs, strict=True) if c <= limit]
         assert (share, top) == (len(kept) / 30, max(kept))
 
 
 def test_nothing_left_is_no_return():
-    shares, best = logs.best_left(of_points([(5, 1), (7, 2)]), [4, 5])
+    shares, best = recordings.best_left(of_points([(5, 1), (7, 2)]), [4, 5])
     assert shares.tolist() == [0, 0.5]
     assert np.isnan(best[0]) and best[1] == 1
 
@@ -73,7 +73,7 @@ def test_best_mixture_is_the_linear_programmes(seed):
     points = np.stack([rng.integers(0, 12, 25), rng.normal(0, 10, 25).round(seed % 3)], 1)
     data = of_points(points)
     limits = np.linspace(0, 14, 9)
-    for limit, found in zip(limits, logs.best_mixture(data, limits), strict=True):
+    for limit, found in zip(limits, recordings.best_mixture(data, limits), strict=True):
         best = linprog(
             -data.episode_returns, A_ub=data.episode_costs[None], b_ub=[limit],
             A_eq=np.ones((1, 25)), b_eq=[1],
@@ -86,16 +86,16 @@ def test_best_mixture_is_the_linear_programmes(seed):
 
 def test_near_best_counts_only_what_keeps_the_limit():
     data = of_points([(0, 100), (0, 91), (0, 89), (10, 95), (30, 500)])
-    assert logs.near_best(data, 0) == 2
-    assert logs.near_best(data, 10) == 3
-    assert logs.near_best(data, 40) == 1
-    assert logs.near_best(of_points([(5, 1)]), 4) == 0
+    assert recordings.near_best(data, 0) == 2
+    assert recordings.near_best(data, 10) == 3
+    assert recordings.near_best(data, 40) == 1
+    assert recordings.near_best(of_points([(5, 1)]), 4) == 0
 
 
 def test_returns_to_go_against_a_double_loop():
-    data = recordings(np.random.default_rng(1))
+    data = random_recordings(np.random.default_rng(1))
     tails = np.arange(30.0)
-    found = logs.returns_to_go(data, 0.9, tails)
+    found = returns_to_go(data, 0.9, tails)
     for e, (start, end) in enumerate(zip(data.starts, data.ends, strict=True)):
         for row in range(start, end):
             expected = sum(0.9 ** (k - row) * data.rewards[k] for k in range(row, end))
@@ -109,13 +109,13 @@ def test_their_mean_over_all_states_against_a_loop_over_episodes():
     dataset = Dataset(zeros, zeros, zeros, rewards, rewards * 0, ends & False, ends)
     to_go = [sum(0.9**k * r for k, r in enumerate(episode[t:]))
              for episode in ([1, -2, 3], [4], [5, 6, -7]) for t in range(len(episode))]  # fmt: skip
-    assert logs.returns_to_go(dataset, 0.9).mean() == pytest.approx(np.mean(to_go), rel=1e-6)
+    assert returns_to_go(dataset, 0.9).mean() == pytest.approx(np.mean(to_go), rel=1e-6)
 
 
 def test_within_looks_ahead_and_not_into_the_next_episode():
-    data = recordings(np.random.default_rng(2))
+    data = random_recordings(np.random.default_rng(2))
     for steps in (1, 3):
-        found = logs.within(data, steps)
+        found = recordings.within(data, steps)
         for row in range(len(data)):
             last = min(row + steps, data.ends[data.episode_index[row]])
             assert found[row] == any(data.costs[row:last])
@@ -137,7 +137,7 @@ def labelled(ax, label):
 
 
 def test_planes_show_every_episode_threshold_and_frontier(three):
-    figure = plotting.planes(three, frontier=True)
+    figure = figures.planes(three, frontier=True)
     assert [ax.get_title() for ax in figure.axes] == ["BallCircle", "BallRun"]
     for ax in figure.axes:
         assert labelled(ax, "episode").tolist() == [[0, 10], [40, 50], [60, 20]]
@@ -149,7 +149,7 @@ def test_planes_show_every_episode_threshold_and_frontier(three):
 
 
 def test_filtered_says_how_many_pass_and_how_good_the_best_is(three):
-    figure = plotting.filtered(three["BallCircle"], get_task("BallCircle"), 45)
+    figure = figures.filtered(three["BallCircle"], get_task("BallCircle"), 45)
     plane = figure.axes[0]
     assert plane.get_title() == "limit 45: 2 of 3 episodes pass, best 50"
     assert labelled(plane, "passes").tolist() == [[0, 10], [40, 50]]
@@ -157,13 +157,13 @@ def test_filtered_says_how_many_pass_and_how_good_the_best_is(three):
 
 
 def test_filtered_can_leave_nothing():
-    figure = plotting.filtered(of_points([(5, 1), (9, 2)]), get_task("BallCircle"), 3)
+    figure = figures.filtered(of_points([(5, 1), (9, 2)]), get_task("BallCircle"), 3)
     assert figure.axes[0].get_title() == "limit 3: 0 of 2 episodes pass"
 
 
 def test_visited_counts_every_step_and_marks_the_cost_zone():
-    data = recordings(np.random.default_rng(3))
-    figure = plotting.visited({"CarCircle": data, "CarRun": data})
+    data = random_recordings(np.random.default_rng(3))
+    figure = figures.visited({"CarCircle": data, "CarRun": data})
     for ax in figure.axes[:2]:
         assert ax.collections[0].get_array().sum() == len(data)
     assert [line.get_xdata()[0] for line in figure.axes[0].lines] == [-6, 6]
@@ -171,18 +171,18 @@ def test_visited_counts_every_step_and_marks_the_cost_zone():
 
 
 def test_examples_left_has_a_bar_for_all_and_one_for_the_good(three):
-    (ax,) = plotting.examples_left({"BallCircle": three["BallCircle"]}).axes
+    (ax,) = figures.examples_left({"BallCircle": three["BallCircle"]}).axes
     assert [bar.get_height() for bar in ax.patches] == [1, 2, 3, 1, 1, 1]
 
 
 def test_at_the_wall_counts_and_averages_per_bin():
-    left, right = plotting.at_the_wall(np.array([-1, -0.9, 0.2, 1.0]), np.array([0, 1, 1, 1]), bins=2).axes
+    left, right = figures.at_the_wall(np.array([-1, -0.9, 0.2, 1.0]), np.array([0, 1, 1, 1]), bins=2).axes
     assert [bar.get_height() for bar in left.patches] == [2, 2]
     assert [bar.get_height() for bar in right.patches] == [0.5, 1]
 
 
 def test_to_go_draws_both_lines():
-    (ax,) = plotting.to_go(np.arange(3), np.array([3, 2, 1]), np.array([4, 4, 4]), 2.0).axes
+    (ax,) = figures.to_go(np.arange(3), np.array([3, 2, 1]), np.array([4, 4, 4]), 2.0).axes
     assert labelled(ax, "the end: nothing follows")[:, 1].tolist() == [3, 2, 1]
     assert labelled(ax, "a cut: the robot goes on at its rate")[:, 1].tolist() == [4, 4, 4]
 

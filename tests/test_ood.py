@@ -6,8 +6,8 @@ import pytest
 import torch
 from scipy.optimize import minimize_scalar
 
-from tutorial_lib import checks, ood, plotting, tabular, widgets
-from tutorial_lib.datasets import Dataset
+from tutorial_lib.course import checks, figures, maximisation_bias, tabular, widgets
+from tutorial_lib.data.dataset import Dataset
 from tutorial_lib.tasks import get_task
 
 
@@ -20,8 +20,8 @@ def without_a_screen():
 
 
 def test_the_bandit_falls_off_at_its_cliff_and_logs_stay_away_from_it():
-    assert ood.bandit_value([-1.0, 0.2, 0.29, 0.31, 1.0]).tolist() == [0, 1.2, 1.29, -1, -1]
-    actions, rewards = ood.bandit_logs(np.random.default_rng(0), 20_000)
+    assert maximisation_bias.bandit_value([-1.0, 0.2, 0.29, 0.31, 1.0]).tolist() == [0, 1.2, 1.29, -1, -1]
+    actions, rewards = maximisation_bias.bandit_logs(np.random.default_rng(0), 20_000)
     assert -0.6 <= actions.min() and actions.max() <= 0.2
     assert (rewards - actions).mean() == pytest.approx(1, abs=0.01)
     assert (rewards - actions).std() == pytest.approx(0.2, abs=0.01)
@@ -41,13 +41,15 @@ def steady(flag, rows=60):
     "flag, value", [("terminals", 1), ("timeouts", 1), ("neither", 1 / (1 - 0.8 * 59 / 60))]
 )
 def test_a_critic_finds_the_value_of_a_steady_reward(flag, value):
-    course = ood.train_critic(steady(flag), lambda c, s, g: c.v(s), kappa=0.5, gamma=0.8, updates=400)
+    course = maximisation_bias.train_critic(
+        steady(flag), lambda c, s, g: c.v(s), kappa=0.5, gamma=0.8, updates=400
+    )
     assert course.updates.tolist() == list(range(0, 401, 20)) and len(course.q) == 21
     assert course.q[-1] == pytest.approx(value, rel=0.05)
 
 
 def test_next_value_is_what_the_critic_looks_ahead_with():
-    course = ood.train_critic(
+    course = maximisation_bias.train_critic(
         steady("neither"), lambda c, s, g: torch.full((len(s),), 10.0), gamma=0.5, updates=300
     )
     assert course.q[-1] == pytest.approx(1 + 0.5 * 10 * 59 / 60, rel=0.05)
@@ -55,13 +57,14 @@ def test_next_value_is_what_the_critic_looks_ahead_with():
 
 def test_the_same_seed_repeats_and_another_does_not():
     runs = [
-        ood.train_critic(steady("neither"), lambda c, s, g: c.v(s), updates=40, seed=s).q for s in (0, 0, 1)
+        maximisation_bias.train_critic(steady("neither"), lambda c, s, g: c.v(s), updates=40, seed=s).q
+        for s in (0, 0, 1)
     ]
     assert np.array_equal(runs[0], runs[1]) and not np.array_equal(runs[0], runs[2])
 
 
 def test_q_is_the_smaller_twin_at_any_depth_of_the_batch():
-    critic = ood.Critic(steady("neither"), scale=10.0, width=8)
+    critic = maximisation_bias.Critic(steady("neither"), scale=10.0, width=8)
     s, a = torch.randn(4, 5, 3), torch.rand(4, 5, 2)
     both = critic.twins(s, a)
     assert both.shape == (2, 4, 5) and critic.q(s, a).shape == (4, 5)
@@ -82,9 +85,9 @@ class Likes:
 
 def test_play_greedy_plays_what_q_likes():
     task = get_task("BallRun")
-    claim, ahead = ood.play_greedy(Likes(1.0, 0.0), task, points=5)
+    claim, ahead = maximisation_bias.play_greedy(Likes(1.0, 0.0), task, points=5)
     assert claim == pytest.approx(7)
-    _, back = ood.play_greedy(Likes(-1.0, 0.0), task, points=5)
+    _, back = maximisation_bias.play_greedy(Likes(-1.0, 0.0), task, points=5)
     assert ahead > 100 > 0 > back
 
 
@@ -161,7 +164,7 @@ def test_the_in_sample_optimum_is_the_best_of_all_policies_on_recorded_actions()
 
 
 def test_two_maxima_stars_the_largest_estimate():
-    left, right = plotting.two_maxima(seed=1).axes
+    left, right = figures.two_maxima(seed=1).axes
     (estimates,) = [line for line in left.lines if line.get_label() == "estimate"]
     (star,) = [line for line in left.lines if line.get_marker() == "*"]
     assert star.get_ydata()[0] == estimates.get_ydata().max()
@@ -169,8 +172,8 @@ def test_two_maxima_stars_the_largest_estimate():
 
 
 def test_courses_draw_each_run_and_both_levels():
-    run = ood.Course(np.arange(3), np.array([1.0, 10, 100]), None)
-    figure = plotting.courses(
+    run = maximisation_bias.Course(np.arange(3), np.array([1.0, 10, 100]), None)
+    figure = figures.courses(
         {"a": ({"maximum": run, "kappa = 0.7": run}, 5.0, 50.0), "b": ({"maximum": run}, 6, 60)}
     )
     for ax, runs, levels in zip(figure.axes, (2, 1), ((5, 50), (6, 60)), strict=True):
@@ -188,13 +191,13 @@ def test_moving_kappa_moves_the_expectile(capsys):
 
 def test_implicit_policies_have_a_column_each():
     x = np.linspace(-1, 1, 5)
-    figure = plotting.implicit_policies(x, x + 2, -(x**2), {"one": (-0.5, x + 2), "two": (-0.2, 3 - x)})
+    figure = figures.implicit_policies(x, x + 2, -(x**2), {"one": (-0.5, x + 2), "two": (-0.2, 3 - x)})
     assert [ax.get_title() for ax in figure.axes[:2]] == ["one", "two"]
     assert figure.axes[3].lines[0].get_ydata() == pytest.approx((3 - x) / 4)
 
 
 def test_towards_the_maximum_draws_its_levels():
-    (ax,) = plotting.towards_the_maximum([0.5, 0.9, 0.99], [1, 2, 3], {"low": 1, "mid": 3, "top": 4}).axes
+    (ax,) = figures.towards_the_maximum([0.5, 0.9, 0.99], [1, 2, 3], {"low": 1, "mid": 3, "top": 4}).axes
     assert ax.lines[0].get_xdata() == pytest.approx([0.5, 0.1, 0.01])
     assert [line.get_ydata()[0] for line in ax.lines[1:]] == [1, 3, 4]
     assert [line.get_label() for line in ax.lines[1:]] == ["low", "mid", "top"]

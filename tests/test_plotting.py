@@ -10,11 +10,12 @@ import pandas as pd
 import pytest
 from PIL import Image
 
-from tutorial_lib import plotting
-from tutorial_lib.algorithms import C2IQL
+from tutorial_lib import style
+from tutorial_lib.agents import C2IQL
 from tutorial_lib.config import get_profile
-from tutorial_lib.datasets import Dataset
-from tutorial_lib.evaluation import Rollout
+from tutorial_lib.course import figures
+from tutorial_lib.data.dataset import Dataset
+from tutorial_lib.playing import Rollout
 from tutorial_lib.tasks import get_task
 
 LIMITS = (30, 50, 70)
@@ -65,14 +66,14 @@ def labelled(ax, label):
 
 def test_a_figure_is_returned_closed_and_in_the_course_style_alone():
     before = dict(matplotlib.rcParams)
-    figure = plotting.paths(played(), get_task("BallCircle"), LIMITS)
+    figure = figures.paths(played(), get_task("BallCircle"), LIMITS)
     assert plt.get_fignums() == []
     assert dict(matplotlib.rcParams) == before
-    assert figure.axes[0].xaxis.get_ticklabels()[0].get_fontsize() == plotting.STYLE["font.size"]
+    assert figure.axes[0].xaxis.get_ticklabels()[0].get_fontsize() == style.STYLE["font.size"]
 
 
 def test_a_notebook_stores_a_figure_small_and_true():
-    figure = plotting.budget(played(), get_task("BallCircle"), LIMITS)
+    figure = figures.budget(played(), get_task("BallCircle"), LIMITS)
     whole = io.BytesIO()
     figure.savefig(whole, format="png", bbox_inches="tight")
     stored = figure.small_png()
@@ -84,18 +85,18 @@ def test_a_notebook_stores_a_figure_small_and_true():
 
 
 def test_paths_has_a_panel_per_episode_and_marks_the_unsafe_steps():
-    figure = plotting.paths(played(cost_from=150), get_task("BallCircle"), LIMITS)
+    figure = figures.paths(played(cost_from=150), get_task("BallCircle"), LIMITS)
     assert [ax.get_title().split(":")[0] for ax in figure.axes] == ["limit 30", "limit 50", "limit 70"]
     for ax in figure.axes:
         assert "cost 50, return 200" in ax.get_title()
         unsafe = labelled(ax, "unsafe: outside").get_xydata()
-        assert 0 < len(unsafe) < 50 and np.all(np.abs(unsafe[:, 0]) > plotting.WALL_X)
+        assert 0 < len(unsafe) < 50 and np.all(np.abs(unsafe[:, 0]) > figures.WALL_X)
         assert np.hypot(*labelled(ax, "where the reward is highest").get_xydata().T) == pytest.approx(7)
         assert sorted(patch.get_x() for patch in ax.patches) == [-6, 6]
 
 
 def test_paths_of_a_run_tell_outside_from_too_fast():
-    figure = plotting.paths(played("BallRun", cost_from=20), get_task("BallRun"), LIMITS)
+    figure = figures.paths(played("BallRun", cost_from=20), get_task("BallRun"), LIMITS)
     outside = labelled(figure.axes[0], "unsafe: outside").get_xydata()
     too_fast = labelled(figure.axes[0], "unsafe: too fast").get_xydata()
     assert len(outside) + len(too_fast) == 80
@@ -104,13 +105,13 @@ def test_paths_of_a_run_tell_outside_from_too_fast():
 
 def test_an_episode_that_ends_early_is_drawn_to_its_end():
     short = played()._replace(lengths=np.array([40, 200, 200]))
-    figure = plotting.paths(short, get_task("BallCircle"), LIMITS)
+    figure = figures.paths(short, get_task("BallCircle"), LIMITS)
     ways = [labelled(ax, "the robot's way").get_xydata() for ax in figure.axes]
     assert [len(way) for way in ways] == [40, 200, 200]
 
 
 def test_budget_draws_cost_limit_and_conditions():
-    figure = plotting.budget(played(), get_task("BallCircle"), LIMITS)
+    figure = figures.budget(played(), get_task("BallCircle"), LIMITS)
     assert len(figure.axes) == 6
     for ax, limit in zip(figure.axes[:3], LIMITS, strict=True):
         assert set(labelled(ax, "limit").get_ydata()) == {limit}
@@ -124,7 +125,7 @@ def test_budget_draws_cost_limit_and_conditions():
 
 def test_an_infinite_condition_has_a_place_and_a_name():
     conditions = np.full((200, 1), np.inf)
-    figure = plotting.budget(played(episodes=1)._replace(conditions=conditions), get_task("BallCircle"), [70])
+    figure = figures.budget(played(episodes=1)._replace(conditions=conditions), get_task("BallCircle"), [70])
     ax = figure.axes[1]
     assert set(labelled(ax, "threshold given").get_ydata()) == {120}
     assert ax.get_yticklabels()[-1].get_text() == "∞"
@@ -132,20 +133,20 @@ def test_an_infinite_condition_has_a_place_and_a_name():
 
 def test_episode_draws_the_one_asked_for():
     short = played()._replace(lengths=np.array([200, 60, 200]))
-    figure = plotting.episode(short, get_task("BallCircle"), 50, e=1)
+    figure = figures.episode(short, get_task("BallCircle"), 50, e=1)
     assert len(labelled(figure.axes[0], "the robot's way").get_xydata()) == 60
     assert set(labelled(figure.axes[1], "limit").get_ydata()) == {50}
 
 
 def test_film_takes_a_picture_at_every_step_asked_for_and_counts_the_cost(agent):
-    frames, costs = plotting.film(agent, 30, seed=1, steps=[0, 3, 6], image_size=(64, 48))
+    frames, costs = figures.film(agent, 30, seed=1, steps=[0, 3, 6], image_size=(64, 48))
     assert frames.shape == (3, 48, 64, 3) and frames.dtype == np.uint8
     assert costs.tolist() == [0, 0, 0]  # it starts on the inside
     assert not np.array_equal(frames[0], frames[2])
 
 
 def test_film_shows_no_red_sphere_before_the_first_unsafe_step(agent):
-    frames, _ = plotting.film(agent, 30, seed=1, steps=[0, 5], image_size=(160, 120))
+    frames, _ = figures.film(agent, 30, seed=1, steps=[0, 5], image_size=(160, 120))
     red = (frames[..., 0] > 180) & (frames[..., 1] < 60) & (frames[..., 2] < 60)
     assert not red.any()
 
@@ -154,20 +155,20 @@ def test_multiple_exposure_keeps_the_scene_and_adds_every_frame():
     frames = np.full((5, 8, 8, 3), 200, np.uint8)
     for i in range(5):
         frames[i, i, 2] = 0
-    picture = plotting.multiple_exposure(frames)
+    picture = figures.multiple_exposure(frames)
     assert picture[7, 7].tolist() == [200] * 3
     shades = picture[range(5), 2, 0]
     assert shades[-1] == 0 and np.all(np.diff(shades.astype(int)) < 0)  # the older, the paler
 
 
 def test_robot_at_limits_has_a_picture_per_limit(agent):
-    figure = plotting.robot_at_limits(agent, (30, 70), seed=1)
+    figure = figures.robot_at_limits(agent, (30, 70), seed=1)
     assert [len(ax.images) for ax in figure.axes] == [1, 1]
     assert [ax.get_title() for ax in figure.axes] == ["at most 30 unsafe steps", "at most 70 unsafe steps"]
 
 
 def test_frames_strip_says_step_and_cost():
-    figure = plotting.frames_strip(np.zeros((2, 6, 8, 3), np.uint8), [0.0, 7.0], [10, 90], 30)
+    figure = figures.frames_strip(np.zeros((2, 6, 8, 3), np.uint8), [0.0, 7.0], [10, 90], 30)
     assert [ax.get_title() for ax in figure.axes] == ["step 10", "step 90"]
     assert figure.axes[1].get_xlabel() == "cost 7 of 30"
 
@@ -177,7 +178,7 @@ def test_learning_curves_draw_a_line_per_seed_from_log_or_file(tmp_path):
     path = tmp_path / "metrics.csv"
     pd.DataFrame(log).to_csv(path, index=False)
     for source in (log, path, str(path)):
-        figure = plotting.learning_curves(source, ["policy_loss"])
+        figure = figures.learning_curves(source, ["policy_loss"])
         (ax,) = figure.axes
         assert len(ax.lines) == 2
         assert ax.lines[1].get_xydata() == pytest.approx(np.array([[10, 1.1], [20, 1.05], [30, 1 + 1 / 30]]))
@@ -185,12 +186,12 @@ def test_learning_curves_draw_a_line_per_seed_from_log_or_file(tmp_path):
 
 def test_learning_curves_hide_the_panels_that_are_left():
     log = [{"seed": 0, "update": 1, "a": 1.0, "b": 2.0, "c": 3.0, "d": 4.0}]
-    figure = plotting.learning_curves(log, ["a", "b", "c", "d"])
+    figure = figures.learning_curves(log, ["a", "b", "c", "d"])
     assert [ax.get_visible() for ax in figure.axes] == [True] * 4 + [False] * 2
 
 
 def test_scores_draw_every_episode_and_the_limits_at_their_height():
-    figure = plotting.scores(results())
+    figure = figures.scores(results())
     reward, cost = figure.axes
     dots = [line for line in cost.lines if line.get_marker() == "o"]
     assert sum(len(line.get_xdata()) for line in dots) == 12
@@ -201,7 +202,7 @@ def test_scores_draw_every_episode_and_the_limits_at_their_height():
 
 
 def test_predicted_against_paid_has_a_panel_per_limit():
-    figure = plotting.predicted_against_paid(results())
+    figure = figures.predicted_against_paid(results())
     for ax, limit in zip(figure.axes, LIMITS, strict=True):
         assert labelled(ax, "episode").get_xydata() == pytest.approx(np.tile([limit - 3, limit - 5], (4, 1)))
         assert set(labelled(ax, "limit").get_ydata()) == {limit}
@@ -213,7 +214,7 @@ def test_cost_return_plane_has_a_dot_per_episode_and_a_line_per_threshold():
     ends = np.array([0, 0, 1, 0, 0, 1], bool)
     costs, rewards = np.array([1, 1, 0, 0, 0, 1], np.float32), np.arange(6, dtype=np.float32)
     dataset = Dataset(zeros, zeros, zeros[:, :2], rewards, costs, np.zeros(6, bool), ends)
-    dots, *limits = plotting.cost_return_plane(dataset, task).axes[0].lines
+    dots, *limits = figures.cost_return_plane(dataset, task).axes[0].lines
     assert dots.get_xydata().tolist() == [[2, 3], [1, 12]]
     assert [line.get_xdata()[0] for line in limits] == [30, 50, 70]
 
@@ -221,7 +222,7 @@ def test_cost_return_plane_has_a_dot_per_episode_and_a_line_per_threshold():
 def test_outside_data_counts_the_critics_that_call_an_action_safe():
     grid = np.linspace(-1, 1, 5)
     estimates = np.array([[0, 0, 0, 9, 9.0], [0, 0, 0, 0, 9.0]])
-    figure = plotting.outside_data(grid, estimates, [0, 0, 5, 9, 9], [-0.5, 0.25], limit=4)
+    figure = figures.outside_data(grid, estimates, [0, 0, 5, 9, 9], [-0.5, 0.25], limit=4)
     left, right = figure.axes
     assert right.lines[0].get_ydata().tolist() == [1, 1, 1, 0.5, 0]
     assert right.lines[1].get_ydata().tolist() == [1, 1, 0, 0, 0]
@@ -231,18 +232,18 @@ def test_outside_data_counts_the_critics_that_call_an_action_safe():
 
 def test_ood_detector_marks_the_upper_quarter():
     known, random = np.geomspace(0.001, 0.1, 300), np.geomspace(0.01, 1, 100)
-    figure = plotting.ood_detector({"BallRun": (known, random)})
+    figure = figures.ood_detector({"BallRun": (known, random)})
     line = labelled(figure.axes[0], "upper quarter: 'outside'").get_xdata()[0]
     assert ((known > line).sum() + (random > line).sum()) == 100
 
 
 def test_values_are_drawn_where_they_are():
-    figure = plotting.against_truth([1.0, 2.0], {"a": [1.0, 2.0], "b": [0.5, 0.1]})
+    figure = figures.against_truth([1.0, 2.0], {"a": [1.0, 2.0], "b": [0.5, 0.1]})
     assert labelled(figure.axes[0], "b").get_xydata().tolist() == [[1, 0.5], [2, 0.1]]
-    figure = plotting.values_by_state({"a": np.array([1.0, 5.0]), "b": np.array([2.0, 2.0])})
+    figure = figures.values_by_state({"a": np.array([1.0, 5.0]), "b": np.array([2.0, 2.0])})
     assert figure.axes[0].lines[0].get_xydata().tolist() == [[0, 1], [1, 5]]
     assert figure.axes[0].get_ylim()[1] > 5.3
-    figure = plotting.cost_of_limits(np.array([1.0, 2.0]), {"a": [0.5, np.nan], "b": [4.0, 3.0]})
+    figure = figures.cost_of_limits(np.array([1.0, 2.0]), {"a": [0.5, np.nan], "b": [4.0, 3.0]})
     assert labelled(figure.axes[0], "b").get_xydata().tolist() == [[1, 4], [2, 3]]
     assert figure.axes[0].get_ylim() == pytest.approx((0, 4.4))
 
@@ -250,13 +251,13 @@ def test_values_are_drawn_where_they_are():
 def test_penalised_state_shows_a_mean_under_the_implicit_policy():
     """Three actions as frequent; at kappa 0.75 the safe good one weighs three times each of the others."""
     q, cost = [8.0, 2.0, -6.0], [5.0, 40.0, 60.0]
-    figure = plotting.penalised_state(q, cost, [1 / 3] * 3, limit=50, kappa=0.75)
+    figure = figures.penalised_state(q, cost, [1 / 3] * 3, limit=50, kappa=0.75)
     costs, worth, policy = figure.axes
     assert "= 5.2" in worth.get_title()  # (3 * 8 + 2 + 0) / 5: the unsafe one is lifted to zero
     bars = sorted((bar.get_x() + 0.25, bar.get_height()) for bar in policy.patches if bar.get_width() == 0.5)
     assert [height for _, height in bars] == pytest.approx([0.6, 0.2, 0.2])
     assert "$V_c$ = 23.0" in policy.get_title() and "35.0" in policy.get_title()
-    everything = plotting.penalised_state(q, cost, [1 / 3] * 3, limit=1, kappa=0.75)
+    everything = figures.penalised_state(q, cost, [1 / 3] * 3, limit=1, kappa=0.75)
     assert "$V_c$ = 35.0" in everything.axes[2].get_title()
     with pytest.raises(ValueError, match="kappa"):
-        plotting.penalised_state(q, cost, [1 / 3] * 3, limit=1, kappa=1.0)
+        figures.penalised_state(q, cost, [1 / 3] * 3, limit=1, kappa=1.0)

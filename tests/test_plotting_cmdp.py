@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from matplotlib.patches import Circle, Rectangle
 
-from tutorial_lib import plotting, tabular, widgets
+from tutorial_lib.course import figures, tabular, widgets
 from tutorial_lib.tasks import get_task
 
 
@@ -32,7 +32,7 @@ def labelled(ax, label):
 
 
 def test_all_eight_tasks_are_shown_with_a_ring_around_the_small_robots():
-    figure = plotting.all_tasks(size=(64, 48))
+    figure = figures.all_tasks(size=(64, 48))
     assert len(figure.axes) == 8 and all(len(ax.images) == 1 for ax in figure.axes)
     pictures = [ax.images[0].get_array().tobytes() for ax in figure.axes]
     assert len(set(pictures)) == 8
@@ -46,7 +46,7 @@ def test_drives_show_each_way_and_its_unsafe_steps(name):
     way = np.stack([np.linspace(0, 9, 10), np.linspace(0, 3, 10)], 1)
     costs = np.abs(way[:, 0]) > 6 if name == "BallCircle" else np.arange(10) % 3 == 0
     drive = SimpleNamespace(positions=way, costs=costs.astype(float), rewards=np.ones(10))
-    figure = plotting.drives(get_task(name), {"one": drive, "two": drive})
+    figure = figures.drives(get_task(name), {"one": drive, "two": drive})
     join = ": " if name == "BallRun" else "\n"
     titles = [f"{title}{join}cost {costs.sum()}, return 10" for title in ("one", "two")]
     assert [ax.get_title() for ax in figure.axes] == titles
@@ -57,13 +57,13 @@ def test_drives_show_each_way_and_its_unsafe_steps(name):
 
 
 def test_the_trade_off_labels_its_dots():
-    (ax,) = plotting.trade_off([0, 5, 9], [1.0, 4.0, 2.0], ["a", "b", "c"], "title").axes
+    (ax,) = figures.trade_off([0, 5, 9], [1.0, 4.0, 2.0], ["a", "b", "c"], "title").axes
     assert ax.lines[0].get_xydata().tolist() == [[0, 1], [5, 4], [9, 2]]
     assert [(text.get_text(), *text.xy) for text in ax.texts] == [("a", 0, 1), ("b", 5, 4), ("c", 9, 2)]
 
 
 def test_the_map_counts_steps_and_hazards():
-    (ax,) = plotting.shortcut_map().axes
+    (ax,) = figures.shortcut_map().axes
     labels = [line.get_label() for line in ax.lines]
     assert labels == [
         "straight on: 4 steps, 3 on hazards",
@@ -107,7 +107,7 @@ def test_the_limits_slider_draws_anew(monkeypatch):
 
 
 def test_bars_are_shares_split_at_the_limit():
-    figure = plotting.episode_costs({"one": np.array([0, 1, 1, 3]), "two": np.array([2, 2, 2, 2])}, 2)
+    figure = figures.episode_costs({"one": np.array([0, 1, 1, 3]), "two": np.array([2, 2, 2, 2])}, 2)
     for ax, heights, mean in zip(figure.axes, ([0.25, 0.5, 0, 0.25], [0, 0, 1, 0]), (1.25, 2), strict=True):
         bars = sorted((bar.get_x() + bar.get_width() / 2, bar.get_height()) for bar in ax.patches)
         assert [height for _, height in bars] == heights

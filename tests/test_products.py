@@ -7,8 +7,8 @@ import pytest
 import torch
 from torch.backends.mkldnn import matmul
 
-from tutorial_lib import products as module
-from tutorial_lib.products import bfloat16_time, products, warn_where_bfloat16_is_slow
+from tutorial_lib import matmul as module
+from tutorial_lib.matmul import bfloat16_time, products, warn_where_bfloat16_is_slow
 
 KINDS = {  # every kind of product in an update, forward and backward, from factors in [1, 2)
     "mm": lambda a, b: (a[0] @ b[0], a[0].double() @ b[0].double()),

@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 import torch
 
-from tutorial_lib import reconstruction
 from tutorial_lib.config import Config
-from tutorial_lib.datasets import Dataset
-from tutorial_lib.reconstruction import (
+from tutorial_lib.costs import reconstruction
+from tutorial_lib.costs.reconstruction import (
     CostReconstruction,
     episode_sums,
     random_sums,
     reconstruction_error,
     train_reconstruction,
 )
+from tutorial_lib.data.dataset import Dataset
 from tutorial_lib.tasks import TASKS
 
 T, GAMMAS = 20, (0.8, 0.85, 0.9)

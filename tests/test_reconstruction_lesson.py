@@ -8,11 +8,11 @@ import pandas as pd
 import pytest
 import torch
 
-from tutorial_lib import checks, heads, plotting, widgets
+from tutorial_lib.course import checks, figures, undiscounting, widgets
 from tutorial_lib.tasks import TASKS
 
 TASK = dataclasses.replace(TASKS["BallRun"], horizon=30, gammas=(0.8, 0.85, 0.9))
-WEIGHTS = torch.tensor(heads.flat_weights(TASK.gammas, 30), dtype=torch.float32)
+WEIGHTS = torch.tensor(undiscounting.flat_weights(TASK.gammas, 30), dtype=torch.float32)
 MODELS = {"weighted": lambda x: x @ WEIGHTS, "nothing": lambda x: torch.zeros(len(x))}
 
 
@@ -70,7 +70,7 @@ def test_a_mistake_gets_its_hint(checker, mistake, hint, capsys):
 
 
 def test_the_flat_curve_is_the_sum_of_its_parts():
-    parts, whole = plotting.flat_curve(WEIGHTS.numpy(), TASK.gammas, 30).axes
+    parts, whole = figures.flat_curve(WEIGHTS.numpy(), TASK.gammas, 30).axes
     curves = [line.get_ydata() for line in parts.lines if len(line.get_ydata()) == 90]
     assert len(curves) == 3
     assert curves[0][:2] == pytest.approx([WEIGHTS[0].item(), WEIGHTS[0].item() * 0.8])
@@ -85,28 +85,28 @@ def test_model_sizes_pick_the_rows_of_their_panel_and_line():
         for a, b in ((0.0, 0.0), (0.1, 0.0))
         for c, d in ((0.0, 0.0), (0.1, 0.0), (0.0, 0.01))
     ]  # fmt: skip
-    figure = plotting.model_sizes(pd.DataFrame(rows), {"clean": (0.0, 0.0), "noisy": (0.1, 0.0)})
+    figure = figures.model_sizes(pd.DataFrame(rows), {"clean": (0.0, 0.0), "noisy": (0.1, 0.0)})
     for ax, offset in zip(figure.axes, (0, 100, 100), strict=True):
         assert list(labelled(ax, "clean").get_ydata()) == pytest.approx([1 + offset, 2 + offset])
         assert list(labelled(ax, "noisy").get_ydata()) == pytest.approx([2 + offset, 3 + offset])
 
 
 def test_time_limits_have_a_bar_for_every_treatment_of_every_task():
-    (ax,) = plotting.time_limits({"A": {"x": 1.0, "y": 2.0}, "B": {"x": 3.0, "y": 4.0}}).axes
+    (ax,) = figures.time_limits({"A": {"x": 1.0, "y": 2.0}, "B": {"x": 3.0, "y": 4.0}}).axes
     assert [patch.get_height() for patch in ax.patches] == [1, 3, 2, 4]
     left = [patch.get_x() + patch.get_width() / 2 for patch in ax.patches]
     assert np.round(left) == pytest.approx([0, 1, 0, 1])
 
 
 def test_settling_draws_each_model_and_the_truth():
-    (ax,) = plotting.settling([0, 10], {"a": [0, 5], "b": [0, 6]}, truth=7).axes
+    (ax,) = figures.settling([0, 10], {"a": [0, 5], "b": [0, 6]}, truth=7).axes
     assert [list(line.get_ydata()) for line in ax.lines] == [[0, 5], [0, 6], [7, 7]]
 
 
 @pytest.mark.parametrize(("head", "error"), [(1, 0.3), (2, -0.2), (3, 1.0)])
 def test_head_error_shows_what_models_answer_and_what_sequences_allow(head, error):
     cost = 12.0
-    figure = plotting.head_error(MODELS, TASK, head, error, cost)
+    figure = figures.head_error(MODELS, TASK, head, error, cost)
     bars, answers = figure.axes
     heights = [patch.get_height() for patch in bars.patches]
     assert heights[head + 2] - heights[head - 1] == pytest.approx(error)

@@ -7,8 +7,8 @@ import pandas as pd
 import pytest
 import torch
 
-from tutorial_lib import reconstruction_study as study
-from tutorial_lib.datasets import Dataset
+from tutorial_lib.data.dataset import Dataset
+from tutorial_lib.studies import reconstruction as study
 from tutorial_lib.tasks import get_task
 
 TASK = get_task("BallRun")

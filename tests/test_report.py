@@ -4,9 +4,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from tutorial_lib import report
-from tutorial_lib.datasets import load_dataset
-from tutorial_lib.results import load_results
+from tutorial_lib.data import sources
+from tutorial_lib.data.sources import load_dataset
+from tutorial_lib.studies import report
+from tutorial_lib.studies.results import load_results
 from tutorial_lib.tasks import DSRL_FRONTIER, get_task
 
 
@@ -16,7 +17,7 @@ def test_the_pages_are_up_to_date():
 
 
 def test_every_shipped_dataset_stays_within_dsrls_bounds_and_size():
-    for name in report.shipped_tasks():
+    for name in sources.shipped_tasks():
         task, data = get_task(name), load_dataset(name)
         assert data.episode_costs.max() <= task.cost_range
         assert data.episode_returns.max() <= task.max_return * (1 + 1e-6)
@@ -26,7 +27,7 @@ def test_every_shipped_dataset_stays_within_dsrls_bounds_and_size():
 def test_every_shipped_dataset_reaches_dsrls_frontier_nearly():
     """In one place one falls short of its mark, and `data/README.md` says so."""
     falls_short = {("AntCircle", 0): 0.72}
-    for name in report.shipped_tasks():
+    for name in sources.shipped_tasks():
         data, mark = load_dataset(name), 0.75 if name.startswith("Ant") else 0.9
         for cost, dsrl in DSRL_FRONTIER[name].items():
             share = falls_short.get((name, cost), mark)

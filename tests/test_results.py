@@ -6,11 +6,12 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from tutorial_lib import plotting
-from tutorial_lib.algorithms import ALGORITHMS
-from tutorial_lib.datasets import load_dataset
-from tutorial_lib.paper import CLAIMS, TABLE1, TABLE1_AVERAGES, TABLE1_STD, TABLE2, Claim
-from tutorial_lib.results import (
+from tutorial_lib.agents import ALGORITHMS
+from tutorial_lib.course import figures
+from tutorial_lib.data.sources import load_dataset
+from tutorial_lib.studies.grids import STUDIES, varied_options
+from tutorial_lib.studies.paper import CLAIMS, TABLE1, TABLE1_AVERAGES, TABLE1_STD, TABLE2, Claim
+from tutorial_lib.studies.results import (
     against,
     difference,
     kept,
@@ -21,7 +22,6 @@ from tutorial_lib.results import (
     seed_means,
     verdicts,
 )
-from tutorial_lib.studies import STUDIES, varied_options
 from tutorial_lib.tasks import TASKS
 
 
@@ -177,7 +177,7 @@ def lines_of(ax):
 
 def test_variants_draws_each_limits_mean_for_each_variant():
     groups = [({"algorithm": "CIQL"}, 0.3, 0.2), ({"algorithm": "C2IQL"}, 0.7, 0.9)]
-    figure = plotting.variants(make_results(groups))
+    figure = figures.variants(make_results(groups))
     left, right = figure.axes
     assert lines_of(left)["CIQL"].get_ydata() == pytest.approx([0.31] * 3)
     assert lines_of(right)["C2IQL"].get_ydata() == pytest.approx([0.91] * 3)
@@ -188,23 +188,23 @@ def test_variants_are_named_by_what_differs():
     both = make_results(
         [({"time_limits": "rate", "kappa_1": 1}, 1, 1), ({"time_limits": "mask", "kappa_1": 1}, 1, 1)]
     )
-    assert set(plotting.variant_names(both)) == {"time limits: rate", "time limits: mask"}
+    assert set(figures.variant_names(both)) == {"time limits: rate", "time limits: mask"}
     sizes = [("linear", 64, 2), ("mlp", 16, 1)]
     columns = [dict(zip(("crm", "crm_width", "crm_layers"), size, strict=True)) for size in sizes]
-    assert set(plotting.variant_names(make_results([(c, 1, 1) for c in columns]))) == {"linear", "1 x 16"}
+    assert set(figures.variant_names(make_results([(c, 1, 1) for c in columns]))) == {"linear", "1 x 16"}
     assert options_of(both) == ["time_limits", "kappa_1"]
 
 
 def test_expectiles_has_a_line_for_each_kappa_2():
     groups = [({"kappa_1": a, "kappa_2": b}, a, b) for a in (0.5, 0.7, 0.9) for b in (0.5, 0.9)]
-    left, right = plotting.expectiles(make_results(groups)).axes
+    left, right = figures.expectiles(make_results(groups)).axes
     assert lines_of(left)[r"$\kappa_2$ = 0.9 (policy)"].get_ydata() == pytest.approx([0.51, 0.71, 0.91])
     assert lines_of(right)[r"$\kappa_2$ = 0.5 (policy)"].get_ydata() == pytest.approx([0.51] * 3)
 
 
 def test_noise_levels_shows_the_papers_beside_ours():
     groups = [({"crm_noise": level}, 0.5, 0.8) for level in (0.0, 0.5, 4.0)]
-    right = plotting.noise_levels(make_results(groups)).axes[1]
+    right = figures.noise_levels(make_results(groups)).axes[1]
     assert lines_of(right)["our cost"].get_ydata() == pytest.approx([0.81 * 50] * 3)
     assert list(lines_of(right)["the paper's"].get_ydata()) == [46.60, 47.89, 36.20]
 
@@ -213,7 +213,7 @@ def test_per_limit_shows_the_cost_paid_under_each_tasks_own_limits():
     parts = [make_results([({}, 0.5, 0.8)], task="CarRun", limits=(10, 20, 40))]
     parts += [make_results([({}, 0.7, 0.5), ({"algorithm": "CPQ"}, 0.2, 2.0)])]
     mixed = pd.concat(parts).sample(frac=1, random_state=0)  # whatever the rows' order
-    figure = plotting.per_limit(mixed)
+    figure = figures.per_limit(mixed)
     costs = {
         ax.get_xlabel() and tuple(ax.get_xticks()): lines_of(ax) for ax in figure.axes if ax.get_xlabel()
     }
@@ -222,19 +222,19 @@ def test_per_limit_shows_the_cost_paid_under_each_tasks_own_limits():
 
 
 def test_against_paper_marks_the_papers_value():
-    left = plotting.against_paper(make_results([({}, 0.5, 0.8)])).axes[0]
+    left = figures.against_paper(make_results([({}, 0.5, 0.8)])).axes[0]
     assert lines_of(left)["the paper's, on DSRL's data"].get_ydata().tolist() == [0.74]
 
 
 def test_promises_draws_every_agents_means():
-    (ax,) = plotting.promises(make_results([({}, 0.5, 0.8)])).axes
+    (ax,) = figures.promises(make_results([({}, 0.5, 0.8)])).axes
     line = lines_of(ax)["high limit"]
     assert line.get_xdata() == pytest.approx([56] * 3) and line.get_ydata() == pytest.approx([56, 56.7, 57.4])
 
 
 def test_expected_costs_draws_each_run_beside_what_the_data_paid():
     log = pd.DataFrame({"cost_critics": [1, 2, 2], "update": [1000, 1000, 2000]})
-    left, right = plotting.expected_costs(
+    left, right = figures.expected_costs(
         log.assign(cost_mean=[56.0, 70.0, 90.0], safe_fraction=[0.5, 0.4, 0.3]), recorded=55.0, unlimited=0.25
     ).axes
     assert lines_of(left)["the highest of 2"].get_xydata().tolist() == [[1, 70], [2, 90]]
@@ -245,8 +245,8 @@ def test_expected_costs_draws_each_run_beside_what_the_data_paid():
 
 def test_without_rows_every_figure_says_that_nothing_was_run():
     empty = load_results("no-such-study")
-    draws = (plotting.variants, plotting.expectiles, plotting.noise_levels, plotting.per_limit)
-    for draw in (*draws, plotting.against_paper, plotting.promises):
+    draws = (figures.variants, figures.expectiles, figures.noise_levels, figures.per_limit)
+    for draw in (*draws, figures.against_paper, figures.promises):
         (ax,) = draw(empty).axes
         assert ax.texts[0].get_text() == "not run: no results to draw"
 
@@ -285,24 +285,24 @@ def test_kept_counts_agents_and_episodes_by_loop():
 
 def test_seeds_raise_one_false_alarm_in_twenty_and_episodes_many():
     rng = np.random.default_rng(1)
-    found = plotting.simulated_intervals(3, 0.05, 2_000, rng)
+    found = figures.simulated_intervals(3, 0.05, 2_000, rng)
     by_episodes, by_seeds = (((x[:, 0] > 0) | (x[:, 1] < 0)).mean() for x in found)
     assert by_seeds == pytest.approx(0.05, abs=0.015) and by_episodes > 0.5
-    same = plotting.simulated_intervals(3, 0.0, 2_000, rng)[0]  # runs that differ in nothing but episodes
+    same = figures.simulated_intervals(3, 0.0, 2_000, rng)[0]  # runs that differ in nothing but episodes
     assert ((same[:, 0] > 0) | (same[:, 1] < 0)).mean() == pytest.approx(0.05, abs=0.02)
 
 
 def test_the_best_checkpoint_flatters_by_the_expected_maximum():
-    scores = plotting.picked_checkpoints(10, 9)
+    scores = figures.picked_checkpoints(10, 9)
     assert scores[:, -1].mean() == pytest.approx(0.7, abs=0.005)
     assert scores.max(1).mean() - 0.7 == pytest.approx(1.5388 * 0.05, abs=0.003)  # of ten normals, tabulated
 
 
 def test_pictures_of_luck_count_and_mark():
-    figure = plotting.false_alarms(3, 0.0)
+    figure = figures.false_alarms(3, 0.0)
     counts = [int(ax.get_title().split(". ")[1].split(" of")[0]) for ax in figure.axes]
     assert all(count <= 4 for count in counts)
-    left = plotting.lucky_checkpoints(30, 5).axes[0]
+    left = figures.lucky_checkpoints(30, 5).axes[0]
     lines = lines_of(left)
     assert lines["the best"].get_ydata()[0] == max(lines["evaluation"].get_ydata())
     assert lines["the last"].get_ydata()[0] == lines["evaluation"].get_ydata()[-1]
@@ -310,7 +310,7 @@ def test_pictures_of_luck_count_and_mark():
 
 def test_room_left_shows_the_best_recorded_episode_within_each_limit():
     data = load_dataset("BallRun")
-    figure = plotting.room_left(make_results([({}, 0.2, 0.9)], task="BallRun"))
+    figure = figures.room_left(make_results([({}, 0.2, 0.9)], task="BallRun"))
     best = [
         max(r for r, c in zip(data.episode_returns, data.episode_costs, strict=True) if c <= limit)
         for limit in (30, 50, 70)

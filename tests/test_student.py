@@ -10,7 +10,7 @@ import student
 from marks import is_solution
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook, new_output
 
-from tutorial_lib import checks
+from tutorial_lib.course import checks
 
 NOTEBOOKS = sorted(Path(__file__).parents[1].glob("notebooks/[0-9]*.ipynb"))
 EXERCISE = '''def keeps_limit(costs, limit):

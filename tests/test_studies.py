@@ -12,20 +12,17 @@ import pytest
 import torch
 from scipy import stats
 
-from tutorial_lib import cells as cells_module
-from tutorial_lib import engine, studies, training
-from tutorial_lib.cells import collect, find_trained, results_path, run_cell
+from tutorial_lib import checkpoints, training
 from tutorial_lib.config import PROFILES, Config
-from tutorial_lib.datasets import (
-    SHIPPED_DATA,
-    Dataset,
-    DatasetError,
-    load_dataset,
-    read_dataset,
-    write_dataset,
-)
-from tutorial_lib.evaluation import evaluate, with_scores
-from tutorial_lib.studies import Grid, Study
+from tutorial_lib.data.dataset import Dataset, DatasetError
+from tutorial_lib.data.hdf5 import read_dataset, write_dataset
+from tutorial_lib.data.sources import SHIPPED_DATA, load_dataset
+from tutorial_lib.playing import evaluate
+from tutorial_lib.scores import with_scores
+from tutorial_lib.studies import cluster, grids
+from tutorial_lib.studies import runs as cells_module
+from tutorial_lib.studies.grids import Grid, Study
+from tutorial_lib.studies.runs import collect, find_trained, results_path, run_cell
 
 TINY = {
     "hidden_width": 8,
@@ -67,7 +64,7 @@ def tiny(config, **changes):
 
 def make_cells(grid, data, **options):
     episodes = options.pop("episodes", 1)
-    chosen = studies.cells(Study("?", (grid,)), change=tiny, data=data, **options)
+    chosen = grids.cells(Study("?", (grid,)), change=tiny, data=data, **options)
     return [dataclasses.replace(cell, episodes=episodes) for cell in chosen]
 
 
@@ -117,16 +114,16 @@ def test_tasks_without_data_are_left_out(tmp_path, monkeypatch):
     monkeypatch.setenv("DSRL_DATASET_DIR", str(tmp_path))
     study = Study("?", (Grid(("BallRun", "CarRun"), ("BC-All",)),))
     with pytest.raises(DatasetError, match=r"CarRun.*no such file: `c2iql fetch CarRun`"):
-        studies.cells(study, data="dsrl")
+        grids.cells(study, data="dsrl")
     make_file(tmp_path / "SafetyBallRun-v0-80-940.hdf5")
-    assert [cell.task for cell in studies.cells(study, data="dsrl")] == ["BallRun"]
+    assert [cell.task for cell in grids.cells(study, data="dsrl")] == ["BallRun"]
 
 
 def test_the_named_studies_are_made_of_known_options_algorithms_and_tasks():
     fields = {field.name for field in dataclasses.fields(Config)}
-    for name, study in studies.STUDIES.items():
-        assert set(studies.varied_options(study)) <= fields
-        found = studies.cells(study)
+    for name, study in grids.STUDIES.items():
+        assert set(grids.varied_options(study)) <= fields
+        found = grids.cells(study)
         assert len({cell.name for cell in found}) == len(found) > 0, name
         for grid in study.grids:
             assert all(set(options) <= set(cells_module.AT_TEST) for options in grid.at_test)
@@ -134,22 +131,22 @@ def test_the_named_studies_are_made_of_known_options_algorithms_and_tasks():
         for cell in found:
             assert cell.build().name == cell.algorithm
     with pytest.raises(ValueError, match="unknown study 'ablation': the studies are table1"):
-        studies.get_study("ablation")
+        grids.get_study("ablation")
 
 
 def test_only_options_that_differ_within_a_grid_are_columns():
     longer = Grid(("AntRun",), options=({"steps": 9},))
     two = Grid(options=({"kappa_1": 0.5}, {"kappa_1": 0.7, "crm": "linear"}), at_test=({},))
     rules = Grid(at_test=({"infinite_at_test": "never"}, {"infinite_at_test": "nearest"}))
-    assert studies.varied_options(Study("?", (longer, two, rules))) == ("kappa_1", "crm", "infinite_at_test")
+    assert grids.varied_options(Study("?", (longer, two, rules))) == ("kappa_1", "crm", "infinite_at_test")
 
 
 def test_the_studies_that_the_paper_has_are_the_papers():
-    kappas = {(c.config.kappa_1, c.config.kappa_2) for c in studies.cells(studies.STUDIES["kappas"])}
+    kappas = {(c.config.kappa_1, c.config.kappa_2) for c in grids.cells(grids.STUDIES["kappas"])}
     assert kappas == {(a, b) for a in (0.5, 0.7, 0.9) for b in (0.5, 0.7, 0.9)}
-    noise = studies.cells(studies.STUDIES["crm-noise"])
+    noise = grids.cells(grids.STUDIES["crm-noise"])
     assert sorted(c.config.crm_noise for c in noise) == [0, 0.1, 0.2, 0.3, 0.5, 1, 2, 4]
-    ablations = studies.cells(studies.STUDIES["ablations"], "CarCircle")
+    ablations = grids.cells(grids.STUDIES["ablations"], "CarCircle")
     assert sorted((c.algorithm, c.threshold or 0) for c in ablations) == sorted(
         [("C2IQL", 0), ("C2IQL w/o CR", 0)]
         + [(name, limit) for name in ("C2IQL w/o CC", "CIQL") for limit in (30, 50, 70)]
@@ -214,7 +211,7 @@ def test_an_agent_that_stopped_early_is_not_taken_for_a_finished_one(data, tmp_p
     (cell,) = make_cells(Grid(("BallRun",), seeds=1), data)
     agent = cell.build()
     training.train(agent, read_dataset(data, "BallRun"), steps=2, progress=False)
-    training.save_agent(agent, tmp_path / "runs" / "a" / "x" / "agent.safetensors")
+    checkpoints.save_agent(agent, tmp_path / "runs" / "a" / "x" / "agent.safetensors")
     (tmp_path / "runs" / "a" / "y").mkdir()
     (tmp_path / "runs" / "a" / "y" / "agent.safetensors").write_bytes(b"half a file")
     assert find_trained(cell, tmp_path / "runs" / "b") is None
@@ -232,7 +229,7 @@ def test_another_dataset_under_the_same_name_is_refused(data, tmp_path):
 
 @pytest.fixture(scope="module")
 def client():
-    with engine.connect(workers=2) as client:
+    with cluster.connect(workers=2) as client:
         yield client
 
 
@@ -246,7 +243,7 @@ def test_two_workers_do_what_one_process_does_and_a_failure_spoils_only_its_own_
     grid = Grid(("BallRun",), ("IQL", "C2IQL", "BC-Safe"), seeds=2)
     chosen = make_cells(grid, data)  # BC-Safe has no episode to learn from at 30
     folder = tmp_path / "runs" / "study"
-    failures = engine.run_cells(chosen, folder, client, progress=False)
+    failures = cluster.run_cells(chosen, folder, client, progress=False)
     (failed,) = failures
     assert failed.startswith("BallRun-BC-Safe-30-")
     assert failures[failed].startswith("DatasetError: BC-Safe: no episode costs at most 30")
@@ -261,7 +258,7 @@ def test_two_workers_do_what_one_process_does_and_a_failure_spoils_only_its_own_
     assert len(rows) == 2 * (3 + 3 + 1 + 1) and list(rows.columns) == COLUMNS
 
     times = {path: path.stat().st_mtime_ns for path in folder.rglob("*") if path.is_file()}
-    assert engine.run_cells(chosen, folder, client, progress=False).keys() == {failed}
+    assert cluster.run_cells(chosen, folder, client, progress=False).keys() == {failed}
     assert {path: path.stat().st_mtime_ns for path in times} == times  # finished cells are skipped
 
 
@@ -275,7 +272,7 @@ def test_a_cell_that_the_scheduler_gives_up_is_a_failure(data, tmp_path, client,
         return future
 
     monkeypatch.setattr(client, "submit", cancelled)
-    found = engine.run_cells([cell], tmp_path / "runs" / "study", client, progress=False)
+    found = cluster.run_cells([cell], tmp_path / "runs" / "study", client, progress=False)
     assert found == {cell.name: "cancelled: the scheduler gave it up"}
 
 
@@ -285,21 +282,21 @@ def test_a_killed_worker_loses_no_cell_and_changes_no_number(data, tmp_path, cli
     chosen[0] = dataclasses.replace(chosen[0], config=dataclasses.replace(chosen[0].config, steps=2_500))
     folder, outcome = tmp_path / "runs" / "study", {}
     runner = threading.Thread(
-        target=lambda: outcome.update(engine.run_cells(chosen, folder, client, progress=False))
+        target=lambda: outcome.update(cluster.run_cells(chosen, folder, client, progress=False))
     )
     pids = client.run(os.getpid)
     runner.start()
-    checkpoint = folder / chosen[0].name / training.CHECKPOINT
+    checkpoint = folder / chosen[0].name / checkpoints.CHECKPOINT
     victim = None
     while runner.is_alive() and not victim:
         time.sleep(0.02)
-        if checkpoint.exists() and training.load_agent(checkpoint).updates:
+        if checkpoint.exists() and checkpoints.load_agent(checkpoint).updates:
             victim = next((w for w, keys in client.processing().items() if chosen[0].name in keys), None)
     assert victim and not results_path(chosen[0], folder).exists()
     os.kill(pids[victim], signal.SIGKILL)
     runner.join()
     assert outcome == {}
-    updates = pd.read_csv(folder / chosen[0].name / training.METRICS)["update"]
+    updates = pd.read_csv(folder / chosen[0].name / checkpoints.METRICS)["update"]
     assert updates.tolist() == list(range(250, 2_501, 250))  # no update twice, none left out
     assert pids[victim] not in client.run(os.getpid).values()
     alone = run_cell(chosen[0], tmp_path / "elsewhere" / "study")
@@ -310,7 +307,7 @@ def test_agents_of_the_small_profile_that_are_shipped_would_be_found(tmp_path):
     """They are an equal run of the study table1 if their data and recipe are today's."""
     own = {"AntRun": {"unsafe_price": 20.0}, "AntCircle": {"unsafe_price": 200.0, "crm_noise_rate": 0.05}}
     own |= {"DroneRun": {"time_limits": "mask"}, "DroneCircle": {"cost_critics": 1}}
-    for cell in studies.cells(studies.STUDIES["table1"], "C2IQL"):
+    for cell in grids.cells(grids.STUDIES["table1"], "C2IQL"):
         assert cell.config == dataclasses.replace(PROFILES["small"], **own.get(cell.task, {}))
         assert cell.threshold is None
         assert find_trained(cell, tmp_path / "runs" / "study") is not None
@@ -332,7 +329,7 @@ def test_returns_and_costs_in_bfloat16_are_those_in_float32(task, score, most):
 
 def test_the_shipped_antcircle_agent_learns_from_the_cheaper_episodes():
     """What `data/README.md` says of its reconstruction's weights, and of what its policy learns from."""
-    agent = training.load_agent(SHIPPED_DATA / "agents" / "AntCircle.safetensors")
+    agent = checkpoints.load_agent(SHIPPED_DATA / "agents" / "AntCircle.safetensors")
     data = load_dataset("AntCircle")
     batch, limit = data.tensors(), torch.full((len(data),), 40.0)
     s, s_next = (agent.network_input(x, limit) for x in (batch.observations, batch.next_observations))

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from tutorial_lib import tabular
-from tutorial_lib.tabular import random_cmdp, shortcut
+from tutorial_lib.course import tabular
+from tutorial_lib.course.tabular import random_cmdp, shortcut
 
 
 def uniform(cmdp):

@@ -22,12 +22,14 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import save_file
 
-from tutorial_lib import products, training
-from tutorial_lib.algorithms import ALGORITHMS, get_algorithm
+from tutorial_lib import training
+from tutorial_lib.agents import ALGORITHMS, get_algorithm
+from tutorial_lib.checkpoints import TrainingError, load_agent, save_agent
 from tutorial_lib.config import Config
-from tutorial_lib.datasets import Dataset, sample_batch
+from tutorial_lib.data.dataset import Dataset, sample_batch
+from tutorial_lib.matmul import products
 from tutorial_lib.tasks import TASKS
-from tutorial_lib.training import TrainingError, load_agent, save_agent, train
+from tutorial_lib.training import train
 
 ROOT = Path(__file__).parents[1]
 CONFIG = Config(

@@ -7,9 +7,9 @@ import matplotlib
 import numpy as np
 import pytest
 
-from tutorial_lib import widgets
-from tutorial_lib.algorithms import C2IQL
+from tutorial_lib.agents import C2IQL
 from tutorial_lib.config import get_profile
+from tutorial_lib.course import widgets
 from tutorial_lib.tasks import get_task
 
 

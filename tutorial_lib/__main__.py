@@ -1,4 +1,4 @@
-"""The command line: `c2iql tasks | collect | fetch | train | evaluate | study | bench | report`.
+"""The command line: `c2iql tasks | collect | fetch | train | evaluate | study | report`.
 
 tyro turns functions and dataclasses into commands with help and types, so no option is written twice.
 """
@@ -15,10 +15,11 @@ import pandas as pd
 import torch
 import tyro
 
-from tutorial_lib import evaluation, studies, training
-from tutorial_lib.algorithms import get_algorithm
+from tutorial_lib import checkpoints, playing, scores, training
+from tutorial_lib.agents import get_algorithm
 from tutorial_lib.config import Config, get_profile
-from tutorial_lib.datasets import fetch_dataset, load_dataset
+from tutorial_lib.data.sources import fetch_dataset, load_dataset
+from tutorial_lib.studies import grids
 from tutorial_lib.tasks import TASKS, get_task
 
 Positional = tyro.conf.Positional
@@ -44,26 +45,26 @@ def fetch(task: Positional[str], directory: Path | None = None) -> None:
 def collect(
     task: Positional[str],
     out: Path | None = None,
-    seeds: tuple[int, ...] = (0,),
+    sources: tuple[str, ...] = ("priced-0", "lagrangian-0"),
     steps: int | None = None,
     episodes: int | None = None,
     runs: Path = Path("runs/collect"),
     workers: int = 2,
 ) -> None:
-    """Make a dataset from the simulator: PPO at many cost prices, thinned on a cost-return grid.
+    """Make a dataset from the simulator with PPO agents of two kinds, thinned on a cost-return grid.
 
     A killed run continues where it was.
 
     Args:
         task: which task, e.g. BallCircle.
         out: the file to write; default runs/collect/TASK.hdf5.
-        seeds: one PPO run each.
+        sources: one PPO run each: a kind, priced or lagrangian, and a seed.
         steps: simulator steps of each run; default the task's recipe.
         episodes: about how many to keep; default the task's recipe.
         runs: folder for what is kept between a kill and a resume.
         workers: PPO runs side by side.
     """
-    from tutorial_lib import collect as collecting  # pulls in stable-baselines3: slow to import
+    from tutorial_lib.data import collect as collecting  # pulls in stable-baselines3: slow to import
 
     check_counts(steps=steps, episodes=episodes, workers=workers)
     recipe = collecting.RECIPES[get_task(task).name]
@@ -72,7 +73,7 @@ def collect(
         recipe, **{key: value for key, value in changes.items() if value is not None}
     )
     out = out or runs / f"{get_task(task).name}.hdf5"
-    dataset = collecting.collect(get_task(task), seeds, recipe, runs, out, workers)
+    dataset = collecting.collect(get_task(task), sources, recipe, runs, out, workers)
     print(f"{out}: {dataset.num_episodes} episodes, {len(dataset)} transitions")
 
 
@@ -108,15 +109,14 @@ def train(
         or Path("runs") / record.name / f"{algorithm.replace(' ', '-').replace('/', '')}{suffix}-{profile}"
     )
     agent = kind(record, config, seeds=seeds, threshold=threshold, device=check_device(device))
-    own = studies.OWN_OPTIONS.get(record.name, {}) if (algorithm, profile) == ("C2IQL", "small") else {}
+    own = grids.OWN_OPTIONS.get(record.name, {}) if (algorithm, profile) == ("C2IQL", "small") else {}
     if any(getattr(config, name) != value for name, value in own.items()):
         words = " ".join(f"{name}={value}" for name, value in own.items())
         print(f"The agents of {record.name} in the results have options of their own: --option {words}")
     training.train(agent, load_dataset(record, data), run_dir=out)
-    training.save_agent(agent, out / "agent.safetensors")
-    print(
-        f"{out}/agent.safetensors: trained for {agent.updates} updates; its log is {out}/{training.METRICS}"
-    )
+    checkpoints.save_agent(agent, out / "agent.safetensors")
+    log = out / checkpoints.METRICS
+    print(f"{out}/agent.safetensors: trained for {agent.updates} updates; its log is {log}")
 
 
 def evaluate(
@@ -139,10 +139,10 @@ def evaluate(
     out = out or agent.with_name(f"{agent.stem}-results.csv")
     if out.is_dir():
         raise ValueError(f"--out {out}: is a folder: name a file")
-    results = evaluation.evaluate(training.load_agent(agent), thresholds, episodes, workers)
-    print(evaluation.summarise(results).round(3).to_string(index=False))
+    results = playing.evaluate(checkpoints.load_agent(agent), thresholds, episodes, workers)
+    print(scores.summarise(results).round(3).to_string(index=False))
     print("(low, high: 95% bootstrap intervals over episodes, all seeds pooled)")
-    evaluation.save_results(results, out)
+    scores.save_results(results, out)
     print(f"{out}: {len(results)} episodes")
 
 
@@ -177,23 +177,23 @@ def study(
         out: the CSV to write; default data/results/NAME.csv, and in a trial runs/studies/NAME.csv.
         dry: only list the cells, and which of them are finished.
     """
-    from tutorial_lib import cells, engine, results  # pulls in dask
+    from tutorial_lib.studies import cluster, results, runs  # pulls in dask
 
     check_counts(workers=workers, steps=steps)
-    record, folder = studies.get_study(name), runs / name
+    record, folder = grids.get_study(name), runs / name
     changes = (*option, *(() if steps is None else (f"steps={steps}",)))
     settings = {"change": lambda config: with_options(config, changes), "profile": profile, "data": data}
-    grid, chosen = studies.cells(record, **settings), studies.cells(record, only, **settings)
+    grid, chosen = grids.cells(record, **settings), grids.cells(record, only, **settings)
     trial = bool(changes) or profile != "small" or data != "shipped"
     out = out or (runs / f"{name}.csv" if trial else results.RESULTS / f"{name}.csv")
     print(record.question)
     if dry:
         for cell in chosen:
-            print("done   " if cells.results_path(cell, folder).exists() else "waiting", cell.name)
+            print("done   " if runs.results_path(cell, folder).exists() else "waiting", cell.name)
         return
-    with engine.connect(scheduler, workers) as client:
-        failures = engine.run_cells(chosen, folder, client)
-    done = cells.collect(grid, folder, out, keep=not trial)
+    with cluster.connect(scheduler, workers) as client:
+        failures = cluster.run_cells(chosen, folder, client)
+    done = runs.collect(grid, folder, out, keep=not trial)
     print(f"{out}: {done} of {len(grid)} cells are finished here")
     for cell, reason in failures.items():
         print(f"FAILED {cell}: {reason}")
@@ -203,50 +203,6 @@ def study(
         )
 
 
-def bench(
-    task: str = "BallCircle",
-    workers: int | None = None,
-    rounds: int = 3,
-    device: Device = "cpu",
-    full: bool = False,
-    peers: bool = False,
-) -> None:
-    """Measure this machine, in about a minute: how fast agents train, and how fast simulators step.
-
-    The table of training has updates per second, the hours that all the profile's updates take, the rate of
-    arithmetic against that of one large matrix product, and the share of the time of each part of an update.
-    The table of simulation compares with the bare simulator's speed times the processes. What else runs on
-    the machine counts, too.
-
-    Args:
-        task: which task's simulator and sizes.
-        workers: processes for rollouts; default one for each core.
-        rounds: how often each speed is measured; the median is shown.
-        device: of the training: cpu or cuda.
-        full: measure every algorithm, other libraries' too, at two tasks' sizes, in some minutes, and write
-            data/results/bench/; then `c2iql report` makes tables and a figure of it.
-        peers: first install the other libraries for --full with pip, into runs/bench/peers.
-    """
-    from tutorial_lib import bench as benchmarks
-
-    record, device = get_task(task), check_device(device)
-    check_counts(workers=workers, rounds=rounds)
-    if peers:
-        benchmarks.install()
-    if full:
-        written = benchmarks.full(workers=workers, rounds=rounds, device=device)
-        print("\n".join(f"wrote {path}" for path in written))
-        return
-    training_speeds, simulation_speeds = benchmarks.bench(record, workers, rounds, device=device)
-    print(f"C2IQL on {record.name}, {device}, {torch.get_num_threads()} thread(s): shares of an update")
-    shares = dict.fromkeys(("of_product", *benchmarks.PARTS), "{:.0%}".format)
-    others = {"updates_per_second": "{:.1f}".format, "hours": "{:.2f}".format}
-    print(training_speeds.to_string(index=False, formatters=shares | others))
-    print(f"\nSimulator of {record.name}: steps per second, and their share of bare simulator x processes")
-    formats = {"steps_per_second": "{:.0f}".format, "of_bare": "{:.0%}".format}
-    print(simulation_speeds.to_string(index=False, formatters=formats))
-
-
 def report(name: Positional[str | None] = None) -> None:
     """Make tables and figures from the results' files: of one study, or all, and the pages that show them.
 
@@ -254,7 +210,7 @@ def report(name: Positional[str | None] = None) -> None:
         name: a study, whose table is printed and whose figure is drawn; without it README.md, data/README.md,
             the pictures of the datasets and all studies' figures.
     """
-    from tutorial_lib import report as reporting
+    from tutorial_lib.studies import report as reporting
 
     if name is None:
         print("\n".join(f"wrote {path}" for path in reporting.write()))
@@ -298,12 +254,12 @@ def check_device(device: Device) -> Device:
 
 def main() -> None:
     """Entry point: errors that a user can mend are one line, without a traceback."""
-    commands = {f.__name__: f for f in (tasks, collect, fetch, train, evaluate, study, bench, report)}
+    commands = {f.__name__: f for f in (tasks, collect, fetch, train, evaluate, study, report)}
     try:
         tyro.extras.subcommand_cli_from_dict(
             commands, prog="c2iql", description="Safe offline RL with C2IQL."
         )
-    except (ValueError, OSError, training.TrainingError) as error:
+    except (ValueError, OSError, checkpoints.TrainingError) as error:
         sys.exit(f"c2iql: {error}")
 
 

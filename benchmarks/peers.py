@@ -1,0 +1,153 @@
+"""Other libraries' updates, timed in a process of their own that sees packages which the course does not.
+
+Peers share our PyTorch, so that they could multiply as fast as we do; everything else of theirs comes from a
+folder. Each is given one ready-made batch again and again: sampling is not counted, unlike for ours. They
+have the paper's widths and batch; all else is as their own examples have it.
+"""
+
+import functools
+import json
+import os
+import subprocess
+import sys
+import types
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from benchmarks.updates import Case, flop_of, random_transitions, timed
+from tutorial_lib.tasks import get_task
+
+FOLDER = Path("runs/bench/peers")
+PACKAGES = (
+    "osrl-lib==0.1.0",
+    "d3rlpy==2.8.1",
+    # What d3rlpy asks for and the course does not have. (OSRL's own list pins an old PyTorch: not installed.)
+    *("gym==0.26.2", "gym_notices", "structlog", "colorama", "dataclasses-json", "marshmallow"),
+    *("typing-inspect", "mypy-extensions", "scikit-learn", "narwhals", "threadpoolctl"),
+)
+
+
+def install(folder: Path = FOLDER) -> None:
+    """Put the peers into a folder with pip: 60 MB. Raises ValueError with pip's last line where it fails."""
+    command = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--upgrade"]
+    done = subprocess.run([*command, "--target", folder, *PACKAGES], capture_output=True, text=True)
+    if done.returncode:
+        reason = (done.stderr.strip() or "pip failed").splitlines()[-1]
+        raise ValueError(f"the peers cannot be installed: {reason}")
+
+
+class Peer:
+    """Times a peer's updates. Raises ValueError, with the reason, where it does not run."""
+
+    def __init__(self, case: Case, device="cpu", folder: Path = FOLDER):
+        self.asked = {"what": case.what, "task": case.task, "profile": case.profile, "device": str(device)}
+        self.process = _process(Path(folder).absolute())
+        self.flop = self._ask(0)["flop"]
+
+    def measure(self, seconds: float) -> dict[str, float]:
+        """Seconds per update."""
+        return {"seconds": self._ask(seconds)["seconds"]}
+
+    def _ask(self, seconds: float) -> dict:
+        try:
+            print(json.dumps(self.asked | {"seconds": seconds}), file=self.process.stdin, flush=True)
+            answer = json.loads(self.process.stdout.readline() or '{"error": "its process died"}')
+        except BrokenPipeError:
+            answer = {"error": "its process died"}
+        if "error" in answer:
+            reason = f"{self.asked['what']}: not measured ({answer['error']})"
+            raise ValueError(f"{reason}; `python -m benchmarks --full --peers` installs it")
+        return answer
+
+
+@functools.cache
+def _process(folder: Path) -> subprocess.Popen:
+    """The process that answers for all peers; it ends with this one, when its input does."""
+    path = [str(folder), str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", "")]
+    threads = str(torch.get_num_threads())
+    return subprocess.Popen(
+        [sys.executable, "-W", "ignore", "-m", __name__],
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(path), "OMP_NUM_THREADS": threads},
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+    )
+
+
+# --- In the peers' process ---
+
+
+def osrl(name: str, task, config, device: str):
+    """OSRL's CPQ or BCQ-Lag: its trainer's step, without a logger."""
+
+    class Logger:
+        def store(self, **scalars):
+            pass
+
+    loggers = types.ModuleType("fsrl.utils")  # all that OSRL takes from that package, which brings much else
+    loggers.DummyLogger = loggers.WandbLogger = Logger
+    sys.modules |= {"fsrl": types.ModuleType("fsrl"), "fsrl.utils": loggers}
+    from osrl import algorithms
+
+    widths = config.hidden_layers * [config.hidden_width]
+    sizes = {"a_hidden_sizes": widths, "c_hidden_sizes": widths, "vae_hidden_sizes": 400, "beta": 0.5}
+    if name == "CPQ":
+        sizes |= {"num_q": 2, "num_qc": 2}  # BCQ-Lag's are pairs already
+    options = sizes | {"episode_len": task.horizon, "device": device}
+    model = getattr(algorithms, name)(task.obs_dim, task.act_dim, 1.0, **options)
+    trainer = getattr(algorithms, f"{name}Trainer")(model, None, Logger(), device=device)
+    x = random_transitions(task, config.batch_size, device)
+    batch = (x.observations, x.next_observations, x.actions, x.rewards, x.costs, x.terminals)
+    return lambda: trainer.train_one_step(*batch)
+
+
+def d3rlpy(task, config, device: str):
+    """d3rlpy's IQL: its update, from NumPy as in its own loop."""
+    from d3rlpy.algos import IQLConfig
+    from d3rlpy.dataset import TransitionMiniBatch
+    from d3rlpy.models.encoders import VectorEncoderFactory
+
+    encoder = VectorEncoderFactory(config.hidden_layers * [config.hidden_width])
+    names = ("actor_encoder_factory", "critic_encoder_factory", "value_encoder_factory")
+    options = IQLConfig(batch_size=config.batch_size, **dict.fromkeys(names, encoder))
+    algorithm = options.create(device="cuda:0" if device == "cuda" else "cpu:0")
+    algorithm.create_impl((task.obs_dim,), task.act_dim)
+    x = random_transitions(task, config.batch_size)
+    s, s_next, a = (field.numpy() for field in (x.observations, x.next_observations, x.actions))
+    column = np.ones((config.batch_size, 1), np.float32)
+    batch = TransitionMiniBatch(s, a, x.rewards[:, None].numpy(), s_next, a, 0 * column, column, [])
+    return lambda: algorithm.update(batch)
+
+
+PEERS = {
+    "OSRL's CPQ": functools.partial(osrl, "CPQ"),
+    "OSRL's BCQ-Lag": functools.partial(osrl, "BCQL"),
+    "d3rlpy's IQL": d3rlpy,
+}
+
+
+@functools.cache
+def _step(what: str, task: str, profile: str, device: str):
+    step = PEERS[what](get_task(task), Case(what, task, profile).config, device)
+    return step, flop_of(step)
+
+
+def main() -> None:
+    """A line of JSON in, one out: what to time and for how long; FLOP and seconds per update, or why not."""
+    answers, sys.stdout = sys.stdout, sys.stderr  # what a peer prints is no answer
+    for line in sys.stdin:
+        asked = json.loads(line)
+        seconds = asked.pop("seconds")
+        try:
+            step, flop = _step(**asked)
+            answer = {"flop": flop, "seconds": timed(step, seconds, asked["device"])}
+        except Exception as error:  # whatever a peer stumbles over
+            answer = {"error": f"{type(error).__name__}: {' '.join(str(error).split())}"}
+        print(json.dumps(answer), file=answers, flush=True)
+
+
+if __name__ == "__main__":
+    main()

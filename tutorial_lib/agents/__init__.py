@@ -1,0 +1,23 @@
+"""The algorithms, by the names that the command line and the results files use.
+
+To add one: write its file, and its class here.
+"""
+
+from tutorial_lib.agents.agent import Agent
+from tutorial_lib.agents.bc import BCAll, BCSafe
+from tutorial_lib.agents.c2iql import C2IQL, C2IQLWithoutCC, C2IQLWithoutCR
+from tutorial_lib.agents.ciql import CIQL
+from tutorial_lib.agents.cpq import CPQ, PushedCPQ
+from tutorial_lib.agents.iql import IQL
+
+ALGORITHMS: dict[str, type[Agent]] = {
+    agent.name: agent
+    for agent in (IQL, CIQL, C2IQLWithoutCR, C2IQLWithoutCC, C2IQL, BCAll, BCSafe, CPQ, PushedCPQ)
+}
+
+
+def get_algorithm(name: str) -> type[Agent]:
+    """The class of the algorithm called `name`, or ValueError that lists those there are."""
+    if name not in ALGORITHMS:
+        raise ValueError(f"unknown algorithm {name!r}: the algorithms are {', '.join(ALGORITHMS)}")
+    return ALGORITHMS[name]

@@ -1,0 +1,1 @@
+"""What C2IQL knows of undiscounted cost: discounting, cost reconstruction and constraint conditioning."""

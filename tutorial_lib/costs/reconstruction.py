@@ -1,0 +1,128 @@
+"""The cost reconstruction model (Algorithm 1): m discounted sums in, the undiscounted sum out.
+
+Whole-episode sums of the dataset and of random 0/1 sequences are its training data. Its baseline is
+linear least squares on the same data, which is nearly exact on clean inputs; the noise on the inputs
+keeps either from answering with large weights of alternating sign that amplify the critics' errors.
+"""
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from tqdm.auto import trange
+
+from tutorial_lib.config import Config
+from tutorial_lib.costs.discounting import cost_sequences, discounted_sums, random_cost_sequences
+from tutorial_lib.data.dataset import Dataset
+from tutorial_lib.networks import Output, in_float32, mlp
+from tutorial_lib.tasks import Task
+
+POOL = 60_000
+"""Random sequences, drawn once: generating new ones for every batch costs more than learning from them."""
+
+
+class CostReconstruction(nn.Module):
+    """R^c of eq. 21: discounted costs (..., m) to an undiscounted cost (...,).
+
+    Discounted sums of one sequence are nearly equal once scaled, and all the news is in their small
+    differences. So the inputs are whitened first (mean zero, uncorrelated, variance one on the noisy
+    training data): the same network then learns in thousands of steps what it else needs a million for.
+    """
+
+    def __init__(self, task: Task, config: Config):
+        super().__init__()
+        m = len(task.gammas)
+        self.horizon = task.horizon
+        self.register_buffer("mean", torch.zeros(m))
+        self.register_buffer("whiten", torch.eye(m))
+        self.net = Output(m, 1) if config.crm == "linear" else mlp(m, config.crm_width, config.crm_layers, 1)
+
+    def forward(self, discounted: Tensor) -> Tensor:
+        whitened = in_float32(lambda x: (x - self.mean) @ self.whiten, discounted)  # where all digits count
+        return self.net(whitened).squeeze(-1) * self.horizon
+
+
+def episode_sums(dataset: Dataset, task: Task) -> tuple[np.ndarray, np.ndarray]:
+    """Algorithm 1's line 3: discounted sums (episodes, m) and sums (episodes,) of the dataset's costs."""
+    costs = cost_sequences(dataset, task.horizon)
+    return discounted_sums(costs, task.gammas), costs.sum(1)
+
+
+def random_sums(task: Task, n: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Lines 9-12: sums of n random sequences, a third each of uniform, block and Beta-shaped times."""
+    parts = [
+        random_cost_sequences(kind, -(-n // 3), task.horizon, rng) for kind in ("uniform", "block", "beta")
+    ]
+    costs = np.concatenate(parts)[rng.permutation(3 * -(-n // 3))[:n]]
+    return discounted_sums(costs, task.gammas), costs.sum(1)
+
+
+def input_noise(task: Task, config: Config) -> Tensor:
+    """Standard deviations of the noise on the m inputs, (m,), in discounted cost."""
+    rate = config.crm_noise_rate / (1 - torch.tensor(task.gammas, dtype=torch.float64))
+    return (config.crm_noise**2 + rate**2).sqrt()
+
+
+def train_reconstruction(
+    task: Task, config: Config, dataset: Dataset, seed: int = 0, device="cpu", progress: bool = True
+) -> CostReconstruction:
+    """Algorithm 1. Half of every batch are the dataset's episodes, half random sequences."""
+    rng = np.random.default_rng(seed)
+    generator = torch.Generator().manual_seed(seed)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        model = CostReconstruction(task, config).to(device)
+    sums = [episode_sums(dataset, task), random_sums(task, POOL, rng)]
+    x, y = (
+        torch.as_tensor(np.concatenate(part), dtype=torch.float64).to(device)
+        for part in zip(*sums, strict=True)
+    )
+    half = [torch.full((len(part),), 0.5 / len(part), dtype=torch.float64) for _, part in sums]
+    share = torch.cat(half).to(device)  # episodes and random sequences count for a half each
+    model.mean.copy_(share @ x)
+    centred = x - share @ x
+    noise_std = input_noise(task, config).to(x)
+    covariance = centred.mT @ (share[:, None] * centred) + torch.diag(noise_std.square())
+    model.whiten.copy_(torch.linalg.inv(torch.linalg.cholesky(covariance)).mT)
+    if config.crm == "linear":
+        # With whitened inputs, least squares is a mean; the noise in the covariance is its ridge penalty.
+        with torch.no_grad():
+            white = centred @ model.whiten.to(x)
+            model.net.weight.copy_((share * (y - share @ y) / task.horizon) @ white)
+            model.net.bias.copy_(share @ y / task.horizon)
+        return model.requires_grad_(False)
+
+    x, y, boundary = x.float(), y.float(), len(sums[0][1])
+    optimiser = torch.optim.Adam(model.parameters(), lr=1e-3)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, config.crm_steps)
+    for _ in trange(config.crm_steps, desc="cost reconstruction", disable=not progress, leave=False):
+        ends = ((0, boundary), (boundary, len(y)))
+        rows = torch.cat(
+            [torch.randint(*end, (config.batch_size // 2,), generator=generator) for end in ends]
+        )
+        noise = torch.randn(len(rows), x.shape[1], generator=generator)
+        rows, noise = (draw.to(device, non_blocking=True) for draw in (rows, noise))
+        noise = noise_std.float() * noise
+        loss = (model(x[rows] + noise) - y[rows]).square().mean() / task.horizon**2  # lines 7 and 14 at once
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        schedule.step()
+    return model.requires_grad_(False)
+
+
+def reconstruction_error(
+    model: CostReconstruction, task: Task, config: Config, dataset: Dataset, seed: int = 1
+) -> float:
+    """Root of the mean squared error, in cost, on the noise that the model was trained for.
+
+    Episodes of the dataset and 10,000 new random sequences count for a half each, as in training.
+    """
+    rng, generator = np.random.default_rng(seed), torch.Generator().manual_seed(seed)
+    noise = input_noise(task, config).float()
+    errors = []
+    for x, y in (episode_sums(dataset, task), random_sums(task, 10_000, rng)):
+        noisy = torch.as_tensor(x).float() + noise * torch.randn(x.shape, generator=generator)
+        with torch.no_grad():
+            found = model(noisy.to(model.mean)).cpu()
+        errors.append((found - torch.as_tensor(y).float()).square().mean().item())
+    return float(np.mean(errors)) ** 0.5

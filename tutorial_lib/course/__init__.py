@@ -1,0 +1,1 @@
+"""What only the notebooks use: figures, checks, sliders and small worlds. Nothing else imports it."""

@@ -1,0 +1,75 @@
+"""Checks that follow a notebook's claims, and what the checkers of its exercises share."""
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+
+from tutorial_lib.course.tabular import CMDP
+from tutorial_lib.tasks import Task
+
+
+def check(name: str, value, expected, tolerance: float = 0.0) -> None:
+    """Is `value` within `tolerance` of `expected`? Arrays: everywhere, and of the same shape."""
+    value, expected = np.asarray(value, float), np.asarray(expected, float)
+    if value.shape != expected.shape and expected.ndim:
+        raise AssertionError(f"FAILED  {name}: shape {value.shape}, expected {expected.shape}")
+    close = np.abs(value - expected) <= tolerance  # False where NaN
+    if not np.all(close):
+        raise AssertionError(f"FAILED  {name} = {text(value)}, expected {text(expected)} +/- {tolerance:g}")
+    print(f"OK  {name} = {text(expected)}" + (f" +/- {tolerance:g}" if tolerance else ""))
+
+
+def check_at_most(name: str, value: float, bound: float) -> None:
+    """Is `value` <= `bound`?"""
+    if not value <= bound:
+        raise AssertionError(f"FAILED  {name} = {text(value)}, expected at most {text(bound)}")
+    print(f"OK  {name} <= {text(bound)}")
+
+
+def check_that(claim: str, holds) -> None:
+    """Does the claim hold? For an array: everywhere."""
+    holds = np.asarray(holds)
+    if not holds.all():
+        where = f" in {np.sum(~holds)} of {holds.size} cases" if holds.ndim else ""
+        raise AssertionError(f"FAILED  {claim}: it does not{where}")
+    print(f"OK  {claim}")
+
+
+def text(value) -> str:
+    if isinstance(value, torch.Tensor):
+        value = value.detach().numpy()
+    if isinstance(value, Task):
+        return value.name
+    if isinstance(value, CMDP):
+        return f"a CMDP of {len(value.initial)} states"
+    if np.ndim(value):
+        return "[" + ", ".join(text(element) for element in value) + "]"
+    is_number = isinstance(value, int | float | np.number | np.ndarray) and not isinstance(value, bool)
+    return f"{value:.5g}" if is_number else str(value)
+
+
+def try_answer(answer: Callable, cases) -> None:
+    """Print the first thing that is wrong with `answer`, or OK. A case: arguments, expected value, hint."""
+    for arguments, expected, hint in cases:
+        shown = ", ".join(text(argument) for argument in arguments)
+        call = f"{answer.__name__}({shown})"
+        try:
+            got = answer(*arguments)
+        except Exception as error:  # whatever a reader's code may do
+            print(f"NOT YET  {call} raised {type(error).__name__}: {error}")
+            return
+        if got is None:
+            print(f"NOT YET  {answer.__name__} returns nothing: write it in place of the `...`")
+            return
+        if not _is_close(got, expected):
+            print(f"NOT YET  {call} = {text(got)}, expected {text(expected)}: {hint}")
+            return
+    print(f"OK  {answer.__name__} is right in {len(cases)} cases")
+
+
+def _is_close(got, expected) -> bool:
+    try:
+        return np.shape(got) == np.shape(expected) and np.allclose(got, expected, atol=1e-6)
+    except (TypeError, ValueError):  # no number
+        return False

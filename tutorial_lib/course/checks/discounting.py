@@ -1,0 +1,72 @@
+"""Notebook 04: its exercises."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from tutorial_lib.costs.discounting import average_threshold, discounted_sums
+from tutorial_lib.course.checks.checker import text, try_answer
+
+
+def check_false_positive(costs, gamma: float = 0.8, limit: float = 3, horizon: int = 10) -> None:
+    """Notebook 04: `costs`, 0 or 1 for each of `horizon` steps: safe, and yet rejected?"""
+    _check_misjudged(costs, gamma, limit, horizon, safe=True)
+
+
+def check_false_negative(costs, gamma: float = 0.8, limit: float = 3, horizon: int = 10) -> None:
+    """Notebook 04: `costs`, 0 or 1 for each of `horizon` steps: unsafe, and yet accepted?"""
+    _check_misjudged(costs, gamma, limit, horizon, safe=False)
+
+
+def _check_misjudged(costs, gamma, limit, horizon, safe):
+    problem = _not_a_sequence(costs, horizon)
+    if problem:
+        print(f"NOT YET  {problem}")
+        return
+    costs = np.asarray(costs, float)
+    total, discounted = costs.sum(), discounted_sums(costs, [gamma])[0]
+    mark = average_threshold(limit, gamma, horizon)
+    if safe and total > limit:
+        print(f"NOT YET  {total:g} unsafe steps: more than the limit {limit:g}, so it is not safe")
+    elif safe and discounted <= mark:
+        print(
+            f"NOT YET  discounted {discounted:.2f}, at most {mark:.2f}: accepted. Let the cost fall earlier"
+        )
+    elif not safe and total <= limit:
+        print(f"NOT YET  {total:g} unsafe steps: within the limit {limit:g}, so it is not unsafe")
+    elif not safe and discounted > mark:
+        print(f"NOT YET  discounted {discounted:.2f}, above {mark:.2f}: rejected. Let it fall later")
+    else:
+        kind = "false positive: safe, and rejected" if safe else "false negative: unsafe, and accepted"
+        print(f"OK  a {kind}")
+
+
+def _not_a_sequence(costs, horizon) -> str:
+    """What is wrong with `costs` as a sequence of `horizon` zeros and ones, or nothing."""
+    if costs is None or costs is ...:
+        return f"no costs: write {horizon} zeros and ones in place of the `...`"
+    try:
+        costs = np.asarray(costs, float)
+    except (TypeError, ValueError):
+        return f"{costs} is no sequence of numbers"
+    if costs.shape != (horizon,):
+        return f"shape {text(costs.shape)}: there are {horizon} steps"
+    return "" if np.isin(costs, (0, 1)).all() else "a step costs 0 or 1"
+
+
+def check_extremes(answer: Callable) -> None:
+    """Notebook 04: `answer(horizon, gamma, limit)`: the fewest steps that L~ rejects, the most it accepts."""
+    hints = {
+        (10, 0.8, 3): "pack the unsafe steps at the start, then at the end, and compare with L~",
+        (4, 0.5, 1): "L~ = 0.469: one step at the start counts 1, the last three together 0.875",
+        (301, 0.99, 50): "Fig. 1's case: count up until L~ is passed",
+        (100, 0.97, 50): "BallRun with its largest discount factor",
+    }
+    cases = []
+    for (horizon, gamma, limit), hint in hints.items():
+        mark = average_threshold(limit, gamma, horizon)
+        powers = gamma ** np.arange(horizon)
+        fewest = 1 + int(np.sum(np.cumsum(powers) <= mark))
+        most = int(np.sum(np.cumsum(powers[::-1]) <= mark))
+        cases.append(((horizon, gamma, limit), (fewest, most), hint))
+    try_answer(answer, cases)

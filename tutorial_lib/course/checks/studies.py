@@ -1,0 +1,81 @@
+"""Notebooks 09 and 10: their exercises."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pandas as pd
+from scipy import stats
+
+from tutorial_lib.course.checks.checker import try_answer
+
+
+def check_paired_interval(answer: Callable) -> None:
+    """Notebook 09: `answer(first, second)`, the 95% interval of the mean paired difference, (low, high)."""
+    cases = []
+    for first, second, hint in (
+        ([0.7, 0.8], [0.6, 0.6], "two seeds: t is 12.71 with one degree of freedom, not 1.96"),
+        ([0.5, 0.7, 0.9], [0.4, 0.6, 0.8], "every pair differs by 0.1: the interval is a point"),
+        ([0.5, 0.9, 0.7], [0.6, 0.6, 0.6], "take the differences seed by seed, and divide by n - 1"),
+        ([0.1, 0.2, 0.4, 0.3, 0.3], [0.3, 0.2, 0.1, 0.1, 0.5], "five seeds have four degrees of freedom"),
+    ):
+        first, second = np.array(first), np.array(second)
+        if np.ptp(first - second) < 1e-9:
+            expected = np.repeat((first - second).mean(), 2)
+        else:
+            expected = np.array(stats.ttest_rel(first, second).confidence_interval(0.95))
+        cases.append(((first, second), expected, hint))
+    try_answer(answer, cases)
+
+
+def check_best_safe(answer: Callable) -> None:
+    """Notebook 09: `answer(rewards, costs)`, the setting of most reward whose cost is at most 1, or -1."""
+    cases = []
+    for rewards, costs, expected, hint in (
+        ([0.5, 0.9, 0.7], [0.4, 0.8, 0.9], 1, "all are safe: the one that earns the most"),
+        ([0.5, 0.9, 0.7], [0.4, 1.2, 0.9], 2, "the best earner is unsafe and does not count"),
+        ([0.5, 0.9], [0.4, 1.0], 1, "a cost of exactly 1 keeps the limit"),
+        ([-0.2, 0.9], [0.7, 2.0], 0, "returns can be negative: what is unsafe is no candidate, not a zero"),
+        ([0.5, 0.9, 0.7], [1.4, 1.2, 1.9], -1, "none is safe: say -1, do not pick the least bad silently"),
+    ):
+        cases.append(((np.array(rewards), np.array(costs)), expected, hint))
+    try_answer(answer, cases)
+
+
+def check_seed_spread(answer: Callable) -> None:
+    """Notebook 10: `answer(scores)`, standard deviation over seeds of the mean over limits and episodes."""
+    cases = []
+    for values, expected, hint in (
+        ({(0, 30): [1, 1], (1, 30): [3, 3]}, 2**0.5, "two seeds with means 1 and 3: divide by n - 1"),
+        ({(0, 30): [0, 2], (1, 30): [2, 0]}, 0.0, "episodes differ, but the seeds' means are equal"),
+        (
+            {(0, 30): [1], (0, 50): [3], (1, 30): [3], (1, 50): [1]},
+            0.0,
+            "limits differ, but the seeds' means over limits are equal",
+        ),
+        (
+            {(0, 30): [1, 1, 1], (0, 50): [3], (1, 30): [2], (1, 50): [2]},
+            0.0,
+            "a limit with more episodes counts no more than another: first over episodes, then over limits",
+        ),
+        (
+            {(0, 30): [0], (0, 50): [2], (1, 30): [3], (1, 50): [5], (2, 30): [6], (2, 50): [8]},
+            3.0,
+            "the seeds' means are 1, 4 and 7",
+        ),
+    ):
+        rows = [(s, limit, v) for (s, limit), column in values.items() for v in column]
+        cases.append(((pd.DataFrame(rows, columns=["seed", "threshold", "score"]),), expected, hint))
+    try_answer(answer, cases)
+
+
+def check_share_kept(answer: Callable) -> None:
+    """Notebook 10: `answer(costs, limits)`, the share of mean costs (A, limits) that keep their limit."""
+    limits = np.array([30.0, 50.0, 70.0])
+    cases = []
+    for costs, expected, hint in (
+        ([[45, 40, 42]], 2 / 3, "the normalised mean is below 1, and yet the limit 30 is broken"),
+        ([[30, 50, 70]], 1.0, "the limit itself is kept"),
+        ([[10, 10, 10], [40, 60, 80]], 0.5, "one agent keeps all three, the other none"),
+    ):
+        cases.append(((np.array(costs, float), limits), expected, hint))
+    try_answer(answer, cases)

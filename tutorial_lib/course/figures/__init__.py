@@ -1,0 +1,16 @@
+"""The course's figures: each function draws one and returns it, closed, so that a notebook shows it once,
+where it is the last value of a cell. One file per idea of the course.
+"""
+
+from tutorial_lib.course.figures.cmdp import *
+from tutorial_lib.course.figures.conditioning import *
+from tutorial_lib.course.figures.discounting import *
+from tutorial_lib.course.figures.episodes import *
+from tutorial_lib.course.figures.luck import *
+from tutorial_lib.course.figures.maximisation_bias import *
+from tutorial_lib.course.figures.penalty import *
+from tutorial_lib.course.figures.reconstruction import *
+from tutorial_lib.course.figures.recordings import *
+from tutorial_lib.course.figures.results import *
+from tutorial_lib.studies.figures import *
+from tutorial_lib.style import *

@@ -1,0 +1,89 @@
+"""The budget rule: what is told at which step after which cost, and how near it comes to the optimum."""
+
+import numpy as np
+from matplotlib.colors import BoundaryNorm, ListedColormap
+from matplotlib.patches import Patch
+
+from tutorial_lib.style import COST, DASHED, LIMIT, NEUTRAL, REWARD, one_figure, subplots
+
+_SHADES = ["#F4F8FB", "#D9E8F3", "#B5D3E7", "#7FB2D6", "#3F8BC0"]
+
+
+@one_figure
+def budget_maps(panels: dict, limits):
+    """What is told (shades) at each step after each cost so far, and what is spent; a panel per limit.
+
+    `panels`: by title, told thresholds (T, C) and the chances of what is spent (T+1, C), or None.
+    """
+    choices = np.unique(np.concatenate([told.ravel() for told, _ in panels.values()]))
+    shades = np.linspace(0, len(_SHADES) - 1, len(choices)).round().astype(int)
+    colours = ListedColormap([_SHADES[shade] for shade in shades])  # the more is told, the darker
+    norm = BoundaryNorm(np.arange(len(choices) + 1) - 0.5, len(choices))
+    figure, axes = subplots(1, len(panels), figsize=(12, 4.8), sharey=True, squeeze=False)
+    top = 1.25 * max(limits)
+    for ax, (title, (told, chances)), limit in zip(axes[0], panels.items(), limits, strict=True):
+        index = np.searchsorted(choices, told).T
+        steps, sums = np.arange(told.shape[0] + 1) - 0.5, np.arange(told.shape[1] + 1) - 0.5
+        ax.pcolormesh(steps, sums, index, cmap=colours, norm=norm)
+        if chances is not None:
+            _draw_spending(ax, chances)
+        ax.axhline(limit, **DASHED, label="limit")
+        ax.set(title=title, xlabel="step", xlim=(0, told.shape[0]), ylim=(-0.5, top))
+        ax.set_xticks(range(0, told.shape[0], told.shape[0] // 4))
+    axes[0, 0].set_ylabel("cost so far")
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    for n, choice in enumerate(choices):
+        handles.append(Patch(facecolor=colours(n), edgecolor=NEUTRAL))
+        labels.append("told ∞" if np.isinf(choice) else f"told {choice:g}")
+    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
+    return figure
+
+
+def _draw_spending(ax, chances):
+    steps = np.arange(len(chances))
+    below = chances.cumsum(1)
+    low, middle, high = ((below < share).sum(1) for share in (0.1, 0.5, 0.9))
+    ax.fill_between(steps, low, high, color=COST, alpha=0.35, linewidth=0, label="spent: 80% of episodes")
+    ax.plot(steps, middle, color=COST, label="median")
+
+
+@one_figure
+def against_optimum(limits, curves: dict, thresholds=()):
+    """Expected return and cost under each limit. `curves`: by name, returns and costs, each like `limits`.
+
+    The first is the measure of the others: a broad pale line. Thresholds are ticks at the bottom.
+    """
+    figure, axes = subplots(1, 2, figsize=(12, 4.8))
+    looks = [dict(color=REWARD, alpha=0.35, linewidth=9), dict(color=LIMIT, linestyle=":"),
+             dict(color=COST), dict(color=NEUTRAL)]  # fmt: skip
+    for (name, pair), look in zip(curves.items(), looks, strict=False):
+        for ax, values in zip(axes, pair, strict=True):
+            ax.plot(limits, values, label=name, **look)
+    axes[1].plot(limits, limits, **DASHED, label="limit")
+    axes[0].set_title("expected return")
+    axes[1].set_title("expected cost")
+    for ax in axes:
+        ax.set_xlabel("limit")
+        low, high = ax.get_ylim()
+        marks = [low + 0.03 * (high - low)] * len(thresholds)
+        ax.plot(thresholds, marks, "^", color=LIMIT, markersize=10, label="thresholds of the set")
+        ax.set_ylim(low, high)
+    figure.legend(*axes[1].get_legend_handles_labels(), loc="outside lower center", ncols=3)
+    return figure
+
+
+@one_figure
+def with_and_without_rule(limits, agents: dict):
+    """Expected cost of each agent under each limit: told the limit once, and told what is left of it.
+
+    `agents`: by title, the costs without and with the rule, each like `limits`.
+    """
+    figure, axes = subplots(1, len(agents), figsize=(12, 4.4), sharey=True, squeeze=False)
+    for ax, (title, (without, with_rule)) in zip(axes[0], agents.items(), strict=True):
+        ax.plot(limits, limits, **DASHED, label="limit")
+        ax.plot(limits, without, "o-", color=NEUTRAL, markersize=8, label="told once, at the start")
+        ax.plot(limits, with_rule, "o-", color=COST, markersize=8, label="told at every step (eq. 23)")
+        ax.set(title=title, xlabel="limit")
+    axes[0, 0].set_ylabel("expected cost")
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
+    return figure

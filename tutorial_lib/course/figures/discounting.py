@@ -1,0 +1,175 @@
+"""When costs fall and what discounting makes of them: timelines, Fig. 1, and the price of a long memory."""
+
+import numpy as np
+from matplotlib.colors import to_rgba
+
+from tutorial_lib.costs.discounting import average_threshold, discounted_sums, misjudged
+from tutorial_lib.style import (
+    COST,
+    DASHED,
+    LIMIT,
+    NEUTRAL,
+    REWARD,
+    legend_below,
+    one_figure,
+    subplots,
+    task_panels,
+)
+
+FALSE_POSITIVE, FALSE_NEGATIVE = "safe, but rejected", "unsafe, but accepted"
+COLOURS = {FALSE_POSITIVE: REWARD, FALSE_NEGATIVE: COST}
+
+
+@one_figure
+def timelines(costs, gamma: float, limit: float, names=None):
+    """Sequences of costs (n, T), one above the other, and what eq. 1 and eq. 2 say of each.
+
+    Left, every unsafe step, the paler the less it counts; right, cost and discounted cost in units of
+    their limits, L and L~.
+    """
+    costs = np.atleast_2d(costs)
+    count, horizon = costs.shape
+    ratios = {
+        "cost $C\\,/\\,L$": costs.sum(1) / limit,
+        r"discounted cost $\tilde C\,/\,\tilde L$": discounted_sums(costs, [gamma])[:, 0]
+        / average_threshold(limit, gamma, horizon),
+    }
+    figure, (steps, bars) = subplots(
+        1, 2, figsize=(12, 1.6 + 0.95 * count), sharey=True, width_ratios=(3, 2), layout="constrained"
+    )
+    for row, sequence in enumerate(costs):
+        _draw_steps(steps, row, sequence, gamma)
+    for offset, (label, values), colour in zip((-0.18, 0.18), ratios.items(), (LIMIT, COST), strict=True):
+        bars.barh(np.arange(count) + offset, values, 0.32, color=colour, label=label)
+    bars.axvline(1, **DASHED, label="limit")
+    bars.locator_params(axis="x", nbins=5)
+    bars.set(xlabel="in units of the limit", xlim=(0, max(1.15, *map(np.max, ratios.values())) * 1.05))
+    names = [f"{total:g} unsafe steps" for total in costs.sum(1)] if names is None else names
+    steps.set_yticks(range(count), names)
+    steps.set(xlabel="step", xlim=(-0.02 * horizon, 1.01 * horizon), ylim=(count - 0.5, -0.5))
+    steps.spines["left"].set_visible(False)
+    steps.tick_params(axis="y", length=0)
+    legend_below(figure, bars)
+    return figure
+
+
+def _draw_steps(ax, row: int, costs, gamma: float):
+    """A grey band per sequence and its unsafe steps on it, coloured by their weight gamma^t."""
+    horizon = len(costs)
+    ax.barh(row, horizon, 0.62, color=NEUTRAL, alpha=0.15)
+    unsafe = np.flatnonzero(costs)
+    colours = [to_rgba(COST, 0.15 + 0.85 * gamma**t) for t in unsafe]
+    ax.bar(unsafe + 0.5, 0.62, 1.0, row - 0.31, color=colours)
+
+
+@one_figure
+def falling_cost(gamma: float, start: int, horizon: int = 301, limit: float = 50, lengths=(40, 60)):
+    """Blocks of unsafe steps, one shorter and one longer than the limit, that both begin at `start`.
+
+    Above, the blocks and the weight gamma^t of a step; below, for every start, their discounted cost in
+    units of L~, with the stretches where it misjudges them.
+    """
+    time, mark = np.arange(horizon), average_threshold(limit, gamma, horizon)
+    figure, (above, below) = subplots(2, 1, figsize=(12, 6), height_ratios=(2, 3), sharex=True)
+    above.fill_between(time, gamma**time, color=NEUTRAL, alpha=0.25, label=r"weight of a step, $\gamma^t$")
+    for length, colour, place in zip(lengths, (REWARD, COST), (0.3, 0.8), strict=True):
+        begin = min(start, horizon - length)
+        word = "safe" if length <= limit else "unsafe"
+        above.barh(place, length, 0.3, begin, color=colour, alpha=0.9, label=f"{length} steps: {word}")
+        starts = np.arange(horizon - length + 1)
+        ratio = gamma**starts * (1 - gamma**length) / (1 - gamma) / mark
+        wrong = (ratio > 1) == (length <= limit)
+        below.plot(starts, ratio, color=colour, linewidth=1.5)
+        kind = FALSE_POSITIVE if length <= limit else FALSE_NEGATIVE
+        below.plot(starts, np.where(wrong, ratio, np.nan), color=colour, linewidth=6, label=kind)
+        below.plot(begin, ratio[begin], "o", color=colour, markersize=13, markeredgecolor="white")
+    below.axhline(1, **DASHED, label=r"limit $\tilde L$")
+    above.set(
+        ylim=(0, 1.05), yticks=(0, 1), title=f"$\\gamma$ = {gamma:g}, both blocks start at step {start}"
+    )
+    below.set(xlabel="step at which the block starts", ylabel=r"$\tilde C\,/\,\tilde L$", ylim=(0, None))
+    below.set_xlim(0, horizon)
+    legend_below(figure, above, below)
+    return figure
+
+
+@one_figure
+def mismatch(panels, ylabel: str = r"discounted cost $\tilde C$"):
+    """Fig. 1: a dot per sequence, its cost and an estimate of it; what the estimate misjudges stands out.
+
+    `panels` maps a title to (costs (n,), estimates (n,), limit of the costs, limit of the estimates).
+    """
+    figure, axes = task_panels(panels, 4.6)
+    for ax, (title, panel) in zip(axes.flat, panels.items(), strict=False):
+        _draw_mismatch(ax, title, *panel)
+    for ax in axes[:, 0]:
+        ax.set_ylabel(ylabel)
+    legend_below(figure, axes[0, 0])
+    return figure
+
+
+def _draw_mismatch(ax, title, cost, estimate, limit, mark):
+    shares = misjudged(cost, estimate, limit, mark)
+    safe, accepted = cost <= limit, estimate <= mark
+    dots = {"linestyle": "", "marker": "o", "markersize": 3, "markeredgewidth": 0, "alpha": 0.5}
+    right = safe == accepted
+    kinds = ((FALSE_POSITIVE, safe & ~accepted), (FALSE_NEGATIVE, ~safe & accepted))
+    for kind, here in (("judged right", right), *kinds):
+        colour = COLOURS.get(kind, NEUTRAL)
+        ax.plot(cost[here], estimate[here], color=colour, **dots)
+        ax.plot([], [], "o", color=colour, markersize=9, label=kind)  # the legend's, to be seen
+    ax.axvline(limit, **DASHED, label="limits")
+    ax.axhline(mark, **DASHED)
+    ax.set(xlabel="cost $C$", xlim=(0, None), ylim=(0, None))
+    ax.set_title(f"{title}\n")
+    words = ((FALSE_POSITIVE, shares.false_positives, 0.0), (FALSE_NEGATIVE, shares.false_negatives, 1.0))
+    for kind, share, x in words:
+        place = {"xy": (x, 1.02), "xycoords": "axes fraction", "ha": "left" if x == 0 else "right"}
+        ax.annotate(f"{share:.1%}", **place, color=COLOURS[kind], fontweight="bold")
+
+
+@one_figure
+def misjudged_shares(counts):
+    """Shares of a dataset's episodes that eq. 2 misjudges, a panel per task.
+
+    `counts` maps a task to {limit: (false positives, false negatives)} as shares; blue bars hang, vermilion
+    ones stand.
+    """
+    figure, axes = task_panels(counts, 3.9, sharey=True)
+    for ax, limits in zip(axes.flat, counts.values(), strict=False):
+        x = np.arange(len(limits))
+        positives, negatives = 100 * np.array(list(limits.values())).T
+        ax.bar(x - 0.2, positives, 0.38, color=COLOURS[FALSE_POSITIVE], label=FALSE_POSITIVE)
+        ax.bar(x + 0.2, negatives, 0.38, color=COLOURS[FALSE_NEGATIVE], label=FALSE_NEGATIVE)
+        ax.set_xticks(x, [f"{limit:g}" for limit in limits])
+        ax.set(xlabel="limit $L$")
+    for ax in axes[:, 0]:
+        ax.set_ylabel("% of the episodes")
+    legend_below(figure, axes[0, 0])
+    return figure
+
+
+@one_figure
+def long_memory(gammas, shares, updates, marked=(), available: float = 400_000):
+    """What a longer memory buys and what it costs, over the horizon 1 / (1 - gamma).
+
+    `shares` maps a name to the shares of sequences misjudged at each gamma (n,); `updates` (n,) are those
+    until a critic has settled; `marked` are gammas to point out, `available` a budget of updates.
+    """
+    memory = 1 / (1 - np.asarray(gammas))
+    figure, (left, right) = subplots(1, 2, figsize=(12, 4.6))
+    for (name, values), style in zip(shares.items(), ("-", "--", ":"), strict=False):
+        left.plot(memory, 100 * np.asarray(values), style, color=COST, label=f"misjudged: {name}")
+    right.plot(memory, updates, color=LIMIT, label="updates until settled")
+    right.axhline(available, color=NEUTRAL, linestyle=":", label=f"{available:,.0f} updates")
+    for gamma in marked:
+        at = 1 / (1 - gamma)
+        right.plot(at, np.interp(at, memory, updates), "o", color=LIMIT, markersize=9)
+        place = {"xytext": (-8, 6), "textcoords": "offset points", "ha": "right"}
+        right.annotate(f"$\\gamma$ = {gamma:g}", (at, np.interp(at, memory, updates)), **place)
+    left.set(
+        xscale="log", xlabel=r"horizon $1 / (1 - \gamma)$ in steps", ylabel="% misjudged", ylim=(0, None)
+    )
+    right.set(xscale="log", yscale="log", xlabel=r"horizon $1 / (1 - \gamma)$ in steps", ylabel="updates")
+    legend_below(figure, left, right)
+    return figure

@@ -1,0 +1,197 @@
+"""The robot in the simulator: from its camera, from above, and step by step."""
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+from tutorial_lib.costs.conditioning import INFINITE_CODE, rescaled_budget
+from tutorial_lib.playing import Rollout, condition, rollout
+from tutorial_lib.style import (
+    COST,
+    DASHED,
+    LIMIT,
+    NEUTRAL,
+    REWARD,
+    Picture,
+    legend_below,
+    one_figure,
+    subplots,
+)
+from tutorial_lib.tasks import Task, make_env
+
+WALL_X, CIRCLE_RADIUS = 6.0, 7.0  # Circle tasks: unsafe where |x| > 6; the reward is highest on the circle
+WALL_Y = 2.0  # Run tasks: unsafe where |y| > 2, and above a speed limit
+
+# --- The robot ---
+
+
+def film(agent, limit: float, seed: int, steps, image_size=(360, 270), run: int = 0):
+    """Pictures of one episode under `limit`, one at each of `steps`; and the cost so far at each of them.
+
+    The simulator draws a red sphere around a robot whose last step was unsafe. Returns uint8 (frames,
+    height, width, 3) and costs (frames,).
+    """
+    env = make_env(agent.task, render_mode="rgb_array", image_size=image_size)
+    observation, _ = env.reset(seed=seed)
+    frames, costs, spent = [], [], 0.0
+    for t in range(max(steps) + 1):
+        if t in steps:
+            frames.append(env.render())
+            costs.append(spent)
+        limits = condition(agent, np.array([limit]), np.array([spent]), t) if agent.conditioned else [limit]
+        observation, _, terminated, _, info = env.step(agent.act(observation[None], limits, run)[0])
+        spent += info["cost"]
+        if terminated:
+            break
+    env.close()
+    return np.stack(frames), np.array(costs)
+
+
+def multiple_exposure(frames: np.ndarray) -> np.ndarray:
+    """One picture from the frames of a still camera: the scene once, what moved every time, older paler."""
+    scene = np.median(frames, axis=0)
+    picture = scene.copy()
+    for frame, strength in zip(frames, np.linspace(0.45, 1.0, len(frames)), strict=True):
+        moved = np.abs(frame - scene).sum(-1) > 60
+        picture[moved] += strength * (frame[moved] - picture[moved])
+    return picture.astype(np.uint8)
+
+
+@one_figure
+def robot_at_limits(agent, limits=None, seed: int = 10):
+    """The same start under each limit (default: the task's three): the robot at several steps at once."""
+    task = agent.task
+    limits = task.thresholds if limits is None else limits
+    steps = range(task.horizon // 3, task.horizon // 3 + 36, 3)  # a Ball's or a Car's lap, about
+    played = rollout(agent, limits, [seed] * len(limits))
+    figure, axes = subplots(1, len(limits), figsize=(3.6 * len(limits), 3.5), squeeze=False)
+    for e, (ax, limit) in enumerate(zip(axes[0], limits, strict=True)):
+        frames, _ = film(agent, limit, seed, steps)
+        ax.imshow(multiple_exposure(frames))
+        ax.set_title(f"at most {limit:g} unsafe steps")
+        ax.set_xlabel(_summary(played, e, "took {cost:.0f}, return {total:.0f}"))
+        ax.set(xticks=[], yticks=[])
+        ax.spines[:].set_visible(False)
+    return figure
+
+
+@one_figure
+def frames_strip(frames, costs, steps, limit: float):
+    """Frames of an episode side by side, each with its step and the cost so far."""
+    figure, axes = subplots(1, len(frames), figsize=(12, 12 / len(frames)), squeeze=False)
+    for ax, frame, cost, step in zip(axes[0], frames, costs, steps, strict=True):
+        ax.imshow(frame)
+        ax.set(xticks=[], yticks=[], title=f"step {step}")
+        ax.set_xlabel(f"cost {cost:.0f} of {limit:g}", color=COST)
+        ax.spines[:].set_visible(False)
+    return figure
+
+
+# --- Episodes ---
+
+
+@one_figure
+def paths(played: Rollout, task: Task, limits):
+    """Each episode of a rollout from above: where the robot was, where that was unsafe, the cost zone."""
+    count = len(limits)
+    run = "Run" in task.name
+    shape, size = ((count, 1), (11, 2.6 * count)) if run else ((1, count), (4 * count, 4.9))
+    figure, axes = subplots(*shape, figsize=size, sharex=True, sharey=True, squeeze=False)
+    for e, (ax, limit) in enumerate(zip(axes.flat, limits, strict=True)):
+        _draw_path(ax, played, e, task)
+        ax.set_title(f"limit {limit:g}: " + _summary(played, e, "cost {cost:.0f}, return {total:.0f}"))
+        ax.label_outer()
+    legend_below(figure, axes[0, 0])
+    return figure
+
+
+@one_figure
+def budget(played: Rollout, task: Task, limits):
+    """Each episode of a rollout: the cost so far against its limit; below, the threshold given (eq. 23)."""
+    count = len(limits)
+    figure, axes = subplots(
+        2, count, figsize=(4 * count, 6), sharex=True, sharey="row", squeeze=False, height_ratios=(3, 2)
+    )
+    for e, limit in enumerate(limits):
+        _draw_cost_so_far(axes[0, e], played, e, limit)
+        _draw_condition(axes[1, e], played, e, limit, task)
+        axes[0, e].set_title(f"limit {limit:g}")
+        axes[1, e].set_xlabel("step")
+    for ax in axes.flat:
+        ax.label_outer()
+    legend_below(figure, *axes[:, 0])
+    return figure
+
+
+@one_figure
+def episode(played: Rollout, task: Task, limit: float, e: int = 0):
+    """One episode: from above, its cost so far against the limit, and the threshold given at each step."""
+    figure, axes = plt.subplot_mosaic(
+        [["path", "cost"], ["path", "condition"]],
+        figsize=(12, 6),
+        height_ratios=(3, 2),
+        width_ratios=(5, 6),
+        FigureClass=Picture,
+    )
+    _draw_path(axes["path"], played, e, task)
+    _draw_cost_so_far(axes["cost"], played, e, limit)
+    _draw_condition(axes["condition"], played, e, limit, task)
+    axes["path"].set_title(f"limit {limit:g}: " + _summary(played, e, "cost {cost:.0f}, return {total:.0f}"))
+    axes["cost"].set_xlim(axes["condition"].get_xlim())
+    axes["cost"].tick_params(labelbottom=False)
+    axes["condition"].set_xlabel("step")
+    legend_below(figure, *axes.values())
+    return figure
+
+
+def _summary(played: Rollout, e: int, words: str) -> str:
+    return words.format(cost=played.costs[:, e].sum(), total=played.rewards[:, e].sum())
+
+
+def _draw_path(ax, played: Rollout, e: int, task: Task):
+    x, y = played.positions[: played.lengths[e], e].T
+    unsafe = played.costs[: played.lengths[e], e] > 0
+    if "Run" in task.name:
+        outside = np.abs(y) > WALL_Y
+        height = max(3.0, 1.1 * np.abs(y).max(), ax.get_ylim()[1])  # panels share their axes
+        for side in (-1, 1):
+            ax.axhspan(side * WALL_Y, side * 1000, color=COST, alpha=0.15, linewidth=0)
+        ax.set(ylim=(-height, height), yticks=(-WALL_Y, 0, WALL_Y))
+    else:
+        outside = np.abs(x) > WALL_X
+        width = max(9.0, 1.1 * np.abs([x, y]).max(), ax.get_xlim()[1])
+        for side in (-1, 1):
+            ax.axvspan(side * WALL_X, side * 1000, color=COST, alpha=0.15, linewidth=0)
+        angle = np.linspace(0, 2 * np.pi, 200)
+        circle = CIRCLE_RADIUS * np.cos(angle), CIRCLE_RADIUS * np.sin(angle)
+        ax.plot(*circle, color=REWARD, linewidth=1.5, alpha=0.6, label="where the reward is highest")
+        ticks = (-WALL_X, 0, WALL_X)
+        ax.set(xlim=(-width, width), ylim=(-width, width), xticks=ticks, yticks=ticks, aspect="equal")
+    ax.plot(x, y, color=NEUTRAL, linewidth=1.5, label="the robot's way", zorder=2)
+    ax.plot(x[0], y[0], "o", color=LIMIT, markersize=8, label="start", zorder=4)
+    for where, marker, words in ((outside, "o", "unsafe: outside"), (~outside, "^", "unsafe: too fast")):
+        if where is outside or "Run" in task.name:
+            here = unsafe & where
+            ax.plot(x[here], y[here], marker, color=COST, markersize=6, label=words, zorder=3)
+    ax.set(xlabel="x (m)", ylabel="y (m)")
+
+
+def _draw_cost_so_far(ax, played: Rollout, e: int, limit: float):
+    spent = np.concatenate([[0], np.cumsum(played.costs[: played.lengths[e], e])])
+    ax.step(np.arange(len(spent)), spent, where="post", color=COST, label="cost so far")
+    ax.axhline(limit, **DASHED, label="limit")
+    ax.set(ylabel="cost so far", ylim=(0, 1.12 * max(ax.get_ylim()[1] / 1.12, spent[-1], limit)))
+
+
+def _draw_condition(ax, played: Rollout, e: int, limit: float, task: Task):
+    steps = np.arange(played.lengths[e])
+    spent = np.concatenate([[0], np.cumsum(played.costs[:, e])])
+    wish = [rescaled_budget(limit, spent[t], t, task.horizon) for t in steps]
+    top = INFINITE_CODE * task.cost_range
+    ax.plot(steps, np.clip(wish, 0, top), color=NEUTRAL, linewidth=1.5, label="eq. 23: budget left, rescaled")
+    given = np.where(np.isinf(played.conditions[steps, e]), top, played.conditions[steps, e])
+    ax.step(steps, given, where="post", color=LIMIT, label="threshold given")
+    infinite = np.isinf(played.conditions[steps, e]).any()
+    finite = sorted({*task.thresholds, *given[given < top]})
+    ticks = [*finite, *([top] if infinite else [])]
+    ax.set_yticks(ticks, [*map("{:g}".format, finite), *(["∞"] if infinite else [])])
+    ax.set(ylabel="threshold", ylim=(-2, 1.1 * (top if infinite else task.cost_range)))

@@ -1,0 +1,122 @@
+"""Luck: what intervals over episodes and picked checkpoints make of runs that do not differ at all."""
+
+import numpy as np
+from matplotlib import ticker
+
+from tutorial_lib.data.recordings import best_left
+from tutorial_lib.data.sources import load_dataset
+from tutorial_lib.scores import normalised_return, with_scores
+from tutorial_lib.studies.figures import algorithm_looks
+from tutorial_lib.studies.results import SCORES, seed_interval
+from tutorial_lib.style import (
+    COST,
+    DASHED,
+    LIMIT,
+    NEUTRAL,
+    REWARD,
+    legend_below,
+    one_figure,
+    subplots,
+    task_panels,
+)
+from tutorial_lib.tasks import get_task
+
+STUDIES, EPISODES, EPISODE_SPREAD = 20, 30, 0.05
+
+
+def simulated_intervals(seeds: int, spread: float, studies: int = STUDIES, rng=None):
+    """Intervals (studies, 2) of a true difference of zero: with episodes as the unit, with seeds as the unit.
+
+    Every study has two variants of `seeds` runs, whose skill varies with standard deviation `spread`; each
+    run plays 30 episodes, which vary by 0.05.
+    """
+    rng = np.random.default_rng(0) if rng is None else rng
+    skill = rng.normal(0, spread, (studies, 2, seeds, 1))
+    episodes = skill + rng.normal(0, EPISODE_SPREAD, (studies, 2, seeds, EPISODES))
+    mean = episodes.mean((2, 3))
+    error = np.sqrt((episodes.var((2, 3)) / (seeds * EPISODES)).sum(1))
+    middle = mean[:, 0] - mean[:, 1]
+    by_episodes = np.stack([middle - 1.96 * error, middle + 1.96 * error], 1)
+    pairs = episodes.mean(3)[:, 0] - episodes.mean(3)[:, 1]
+    return by_episodes, np.array([seed_interval(row) for row in pairs])
+
+
+@one_figure
+def false_alarms(seeds: int = 3, spread: float = 0.05):
+    """Twenty studies of two variants that are equal: which intervals claim a difference?"""
+    figure, axes = subplots(1, 2, figsize=(12, 4.6), sharey=True)
+    intervals = simulated_intervals(seeds, spread)
+    for ax, found, unit in zip(axes, intervals, ("episode", "seed"), strict=True):
+        wrong = (found[:, 0] > 0) | (found[:, 1] < 0)
+        for x, (low, high) in enumerate(found):
+            colour = COST if wrong[x] else NEUTRAL
+            ax.errorbar(x, (low + high) / 2, (high - low) / 2, fmt="o", color=colour, capsize=4, markersize=6)
+        ax.axhline(0, **DASHED)
+        ax.set(
+            title=f"unit: the {unit}. {wrong.sum()} of {STUDIES} see a difference", xlabel="simulated study"
+        )
+        ax.set_xticks([])
+    axes[0].set_ylabel("difference in score")
+    axes[0].set_ylim(-0.35, 0.35)
+    return figure
+
+
+def picked_checkpoints(checkpoints: int, episodes: int, runs: int = 2_000) -> np.ndarray:
+    """Evaluations (runs, checkpoints) of agents whose true score is 0.7 at all times."""
+    rng = np.random.default_rng(0)
+    return 0.7 + rng.normal(0, 0.15 / episodes**0.5, (runs, checkpoints))
+
+
+@one_figure
+def lucky_checkpoints(checkpoints: int = 20, episodes: int = 5):
+    """One run's evaluations, and what is reported on average: the last checkpoint, or the best seen."""
+    scores = picked_checkpoints(checkpoints, episodes)
+    figure, axes = subplots(1, 2, figsize=(12, 4.4), sharey=True)
+    axes[0].plot(range(1, checkpoints + 1), scores[0], "o-", color=NEUTRAL, linewidth=1.5, label="evaluation")
+    best = int(scores[0].argmax())
+    axes[0].plot(best + 1, scores[0, best], "D", color=COST, markersize=12, label="the best")
+    axes[0].plot(checkpoints, scores[0, -1], "s", color=REWARD, markersize=12, label="the last")
+    axes[0].set(title="one run", xlabel="checkpoint", ylabel="score")
+    axes[0].xaxis.set_major_locator(ticker.MaxNLocator(integer=True))
+    reported = {"the last": (scores[:, -1], REWARD), "the best": (scores.max(1), COST)}
+    for place, (values, colour) in enumerate(reported.values()):
+        style = {"color": colour, "capsize": 8, "markersize": 11}
+        axes[1].errorbar(place, values.mean(), values.std(), fmt="o", **style)
+    axes[1].set_xticks([0, 1], reported, fontsize=14)
+    axes[1].set(title="2,000 runs: mean and spread of what is reported", xlim=(-0.6, 1.6))
+    for ax in axes:
+        ax.axhline(0.7, **DASHED, label="the truth, always")
+    axes[0].set_ylim(0.3, 1.1)
+    legend_below(figure, axes[0])
+    return figure
+
+
+@one_figure
+def room_left(results):
+    """Per task and limit: the best recorded episode within the limit, and what the algorithms earn there.
+
+    A hollow mark breaks its limit: what it earns does not count.
+    """
+    scored = with_scores(results)
+    tasks = list(scored["task"].unique())
+    figure, axes = task_panels(tasks, 3.6, sharey=True)
+    looks = algorithm_looks(scored)
+    for ax, name in zip(axes.flat, tasks, strict=False):
+        task, data = get_task(name), load_dataset(name)
+        best = normalised_return(best_left(data, task.thresholds)[1], task)
+        ax.plot(range(3), best, "_", color=LIMIT, markersize=40, markeredgewidth=3, label="best recorded")
+        for algorithm in ("C2IQL", "BC-Safe"):
+            part = scored[(scored["task"] == name) & (scored["algorithm"] == algorithm)]
+            means = part.groupby("threshold")[list(SCORES)].mean().reindex(task.thresholds)
+            if means.notna().any(axis=None):
+                look, rewards = looks[algorithm] | {"linewidth": 1.5}, means["reward_score"].to_numpy()
+                ax.plot(range(3), rewards, **look, label=algorithm)
+                unsafe = np.flatnonzero(means["cost_score"] > 1)
+                ax.plot(unsafe, rewards[unsafe], **look | {"linestyle": "", "markerfacecolor": "white"})
+        ax.set_xticks(range(3), [f"{limit:g}" for limit in task.thresholds])
+        ax.set(xlabel="limit", xlim=(-0.5, 2.5))
+    axes[0, 0].set_ylim(0, None)
+    for ax in axes[:, 0]:
+        ax.set_ylabel("normalised return")
+    legend_below(figure, *axes[0])
+    return figure

@@ -1,0 +1,130 @@
+"""Penalties and implicit policies: who is asked outside the data, and what a limit does to one state."""
+
+import numpy as np
+
+from tutorial_lib.course import tabular
+from tutorial_lib.style import COST, DASHED, LIMIT, NEUTRAL, REWARD, legend_below, one_figure, subplots
+
+
+@one_figure
+def outside_data(grid, estimates, truth, recorded, limit: float):
+    """Costs that k critics (k, G) expect of the actions on `grid` (G,), beside the truth (G,).
+
+    Left, every critic, with the recorded actions below; right, the share of critics that call an action safe.
+    """
+    grid, estimates, truth, recorded = (np.asarray(x) for x in (grid, estimates, truth, recorded))
+    figure, (left, right) = subplots(1, 2, figsize=(12, 4.6))
+    for ax in (left, right):
+        ax.axvspan(recorded.min(), recorded.max(), color=NEUTRAL, alpha=0.15, label="recorded actions")
+        ax.set(xlabel="action", xlim=(grid[0], grid[-1]))
+        ax.locator_params(axis="x", nbins=5)
+    for row, line in enumerate(estimates):
+        left.plot(grid, line, color=COST, alpha=0.45, linewidth=1.2, label="" if row else "a critic")
+    left.plot(grid, truth, color=LIMIT, label="truth")
+    left.axhline(limit, **DASHED, label="limit")
+    left.set(title="expected cost", ylim=(0, 1.1 * truth.max()))
+    right.plot(grid, (estimates <= limit).mean(0), color=COST)
+    right.plot(grid, truth <= limit, color=LIMIT)
+    right.set(title="called safe: share of critics, and truth", ylim=(-0.03, 1.05))
+    legend_below(figure, left)
+    return figure
+
+
+@one_figure
+def ood_detector(divergences: dict):
+    """What a VAE's encoder says of recorded and of random actions: {task: (recorded, random)}, both (n,).
+
+    The dashed line leaves a quarter of both to its right: what CPQ would call outside, if it had them.
+    """
+    figure, axes = subplots(1, len(divergences), figsize=(12, 4.4), squeeze=False)
+    for ax, (name, (recorded, random)) in zip(axes[0], divergences.items(), strict=True):
+        both = np.concatenate([recorded, random])
+        bins = np.geomspace(np.quantile(both, 0.005), np.quantile(both, 0.998), 40)
+        ax.hist(recorded, bins, color=REWARD, alpha=0.55, label="recorded actions")
+        ax.hist(random, bins, color=COST, alpha=0.55, label="random actions")
+        ax.axvline(np.quantile(both, 0.75), **DASHED, label="upper quarter: 'outside'")
+        ax.set(xscale="log", title=name, xlabel="KL divergence of the latent", yticks=[])
+    legend_below(figure, axes[0, 0])
+    return figure
+
+
+@one_figure
+def against_truth(truth, values: dict):
+    """Values by some formulas, {label: (n,)}, against the truth (n,): right is on the diagonal."""
+    figure, ax = subplots(figsize=(8, 5))
+    end = 1.05 * np.max(truth)
+    ax.plot([0, end], [0, end], color=NEUTRAL, linewidth=1.5, label="right")
+    for (label, found), colour, marker in zip(values.items(), (REWARD, COST, LIMIT), "ovs", strict=False):
+        ax.plot(truth, found, marker, color=colour, markersize=5, alpha=0.5, label=label)
+    ax.set(xlabel="$V_c$ of $\\pi_{imp}$, by a linear solve", ylabel="by the formula")
+    ax.set(xlim=(0, end), ylim=(0, None))
+    legend_below(figure, ax)
+    return figure
+
+
+@one_figure
+def values_by_state(values: dict):
+    """A value for every state, {label: (S,)}, as rows of markers."""
+    figure, ax = subplots(figsize=(12, 4))
+    styles = zip(values.items(), (LIMIT, REWARD, COST), ("D", "o", "_"), (11, 9, 26), strict=False)
+    for (label, row), colour, marker, size in styles:
+        ax.plot(row, marker, color=colour, markersize=size, markeredgewidth=3 if marker == "_" else 0)
+        ax.plot([], [], marker, color=colour, markersize=10, markeredgewidth=3, label=label)
+    ax.set(xlabel="state", ylabel="$V_c$", xticks=range(len(row)))
+    ax.set_ylim(0, 1.12 * max(np.max(row) for row in values.values()))
+    legend_below(figure, ax)
+    return figure
+
+
+@one_figure
+def cost_of_limits(limits, costs: dict):
+    """What implicit policies cost, {label: (n,)}, that were trained for each of `limits` (n,).
+
+    NaN where the iteration did not settle: the line has a gap there. Below the dashed line the limit is kept.
+    """
+    figure, ax = subplots(figsize=(11, 4.8))
+    ax.plot([0, limits[-1]], [0, limits[-1]], **DASHED, label="cost = limit")
+    for (label, row), colour, marker in zip(costs.items(), (REWARD, NEUTRAL, COST), "os^", strict=False):
+        ax.plot(limits, row, marker + "-", color=colour, markersize=7, linewidth=1.5, label=label)
+    ax.set(xlabel=r"limit $\tilde L$", ylabel="cost of the implicit policy")
+    ax.set_xlim(0, 1.02 * limits[-1])
+    ax.set_ylim(0, 1.1 * max(np.nanmax(row) for row in costs.values()))
+    legend_below(figure, ax)
+    return figure
+
+
+@one_figure
+def penalised_state(q_reward, q_cost, behaviour, limit: float, kappa: float):
+    """Eqs. 11 to 17 in one state with A actions, all (A,): the penalty, V_r, and the implicit policy.
+
+    Raises ValueError unless kappa lies within (0, 1).
+    """
+    if not 0 < kappa < 1:
+        raise ValueError(f"kappa must lie in (0, 1), not {kappa}")
+    q_reward, q_cost, behaviour = (np.asarray(x, float) for x in (q_reward, q_cost, behaviour))
+    unsafe = q_cost > limit
+    q = np.where(unsafe, 0.0, q_reward)
+    v = tabular.expectile(behaviour[None], q[None], kappa)
+    policy = tabular.implicit_policy(
+        behaviour[None], q[None], v, lambda u: tabular.expectile_weight(u, kappa)
+    )[0]
+    actions = np.arange(len(q))
+    colours = np.where(unsafe, COST, REWARD)
+    figure, axes = subplots(1, 3, figsize=(12, 4.4))
+    axes[0].bar(actions, q_cost, color=colours)
+    axes[0].axhline(limit, **DASHED, label="limit")
+    axes[0].set(title="$Q_c$", ylim=(0, 1.15 * q_cost.max()))
+    axes[1].bar(actions, q_reward, fill=False, edgecolor=NEUTRAL, linewidth=1.5, label="before the penalty")
+    axes[1].bar(actions, q, color=colours)
+    axes[1].plot(actions[unsafe], q[unsafe], "_", color=COST, markersize=22, markeredgewidth=5)
+    axes[1].axhline(v[0], color=LIMIT, label="$V_r$")
+    axes[1].set(title=f"$Q_{{r|c}}$ and $V_r$ = {v[0]:.1f}")
+    axes[2].bar(actions, behaviour, fill=False, edgecolor=NEUTRAL, linewidth=1.5, label=r"$\mu$")
+    axes[2].bar(actions, policy, width=0.5, color=colours)
+    axes[2].set(title=f"$\\pi_{{imp}}$: $V_c$ = {policy @ q_cost:.1f}, $\\mu$: {behaviour @ q_cost:.1f}")
+    axes[1].bar([0], [0], color=REWARD, label="safe")
+    axes[1].bar([0], [0], color=COST, label="unsafe")
+    for ax in axes:
+        ax.set(xticks=actions, xticklabels=[chr(ord("a") + i) for i in actions])
+    legend_below(figure, *axes)
+    return figure

@@ -1,0 +1,149 @@
+"""Notebook 02: recordings before anything is learned from them."""
+
+import numpy as np
+from matplotlib.colors import LogNorm
+
+from tutorial_lib.course.figures.episodes import WALL_X, WALL_Y
+from tutorial_lib.data.recordings import best_left, best_mixture, near_best, positions
+from tutorial_lib.style import (
+    COST,
+    DASHED,
+    LIMIT,
+    NEUTRAL,
+    REWARD,
+    legend_below,
+    one_figure,
+    subplots,
+    task_panels,
+)
+from tutorial_lib.tasks import DSRL_FRONTIER, Task, get_task
+
+DOTS = {"marker": "o", "linestyle": "none", "markersize": 3, "alpha": 0.4, "markeredgewidth": 0}
+
+
+@one_figure
+def planes(datasets: dict, frontier: bool = False):
+    """Every episode of every dataset {task name: Dataset} by cost and return, thresholds dashed.
+
+    `frontier` adds the best return left under each limit, the best mixture of episodes, and DSRL's frontier.
+    """
+    figure, axes = task_panels(datasets, 3.6)
+    for ax, (name, data) in zip(axes.flat, datasets.items(), strict=False):
+        task = get_task(name)
+        ax.plot(data.episode_costs, data.episode_returns, color=NEUTRAL, label="episode", **DOTS)
+        for threshold in task.thresholds:
+            ax.axvline(threshold, **(DASHED | {"linewidth": 1.5}), label="threshold")
+        if frontier:
+            limits = np.linspace(0, task.cost_range, 401)
+            ax.plot(limits, best_left(data, limits)[1], color=REWARD, label="best episode left")
+            mix = {"color": REWARD, "linewidth": 1.5, "linestyle": ":"}
+            ax.plot(limits, best_mixture(data, limits), label="best mixture", **mix)
+            mark = {"color": COST, "markersize": 9, "label": "DSRL's frontier, read off its plots"}
+            ax.plot(*zip(*DSRL_FRONTIER[name].items(), strict=True), "D", **mark)
+        ax.set(xlabel="cost", xticks=[0, *task.thresholds])
+    for ax in axes[:, 0]:
+        ax.set_ylabel("return")
+    legend_below(figure, *axes.flat)
+    return figure
+
+
+@one_figure
+def filtered(dataset, task: Task, limit: float):
+    """BC-Safe's filter at one limit: which episodes pass; and, over all limits, how many and how good."""
+    passes = dataset.episode_costs <= limit
+    costs, returns = dataset.episode_costs, dataset.episode_returns
+    figure, (plane, over) = subplots(1, 2, figsize=(12, 4.8))
+    for chosen, colour, words in ((~passes, NEUTRAL, "filtered out"), (passes, REWARD, "passes")):
+        look = DOTS | {"markersize": 4, "alpha": 0.6, "color": colour, "label": words}
+        plane.plot(costs[chosen], returns[chosen], **look)
+    plane.axvline(limit, **DASHED, label="limit")
+    words = f"limit {limit:g}: {passes.sum()} of {len(passes)} episodes pass"
+    if passes.any():
+        best = np.flatnonzero(passes)[returns[passes].argmax()]
+        look = {"color": REWARD, "markersize": 20, "markeredgecolor": LIMIT}
+        plane.plot(costs[best], returns[best], "*", label="the best of them", **look)
+        words += f", best {returns[best]:.0f}"
+    plane.set(title=words, xlabel="cost of the episode", ylabel="return of the episode")
+
+    limits = np.linspace(0, task.cost_range, 401)
+    shares, tops = best_left(dataset, limits)
+    over.plot(limits, shares, color=NEUTRAL, label="episodes left / all")
+    over.plot(limits, tops / returns.max(), color=REWARD, label="best return left / best of all")
+    over.axvline(limit, **DASHED)
+    over.set(title="over all limits", xlabel="limit", ylim=(0, 1.05))
+    legend_below(figure, plane, over)
+    return figure
+
+
+@one_figure
+def visited(datasets: dict):
+    """Where the robot was after each recorded step, as steps per bin; lines mark the cost zones."""
+    figure, axes = task_panels(datasets, 3.5)
+    for ax, (name, data) in zip(axes.flat, datasets.items(), strict=False):
+        x, y = positions(data).T
+        run = "Run" in name
+        bins = [np.linspace(x.min(), x.max(), 61), np.linspace(y.min(), y.max(), 61)]
+        *_, picture = ax.hist2d(x, y, bins, norm=LogNorm(1, 3000), cmap="Blues")
+        line = ax.axhline if run else ax.axvline
+        for side in (-1, 1):
+            line(side * (WALL_Y if run else WALL_X), color=COST, linewidth=2, label="edge of the cost zone")
+        ax.set(xlabel="x (m)", facecolor="white")
+        if run:
+            low = min(-1.15 * WALL_Y, y.min())
+            ax.set_ylim(low, max(1.15 * WALL_Y, y.max()))
+        else:
+            ax.set_aspect("equal")
+    for ax in axes[:, 0]:
+        ax.set_ylabel("y (m)")
+    figure.colorbar(picture, ax=axes, label="steps per bin", shrink=0.8)
+    legend_below(figure, axes[0, 0])
+    return figure
+
+
+@one_figure
+def examples_left(datasets: dict, share: float = 0.9):
+    """Episodes that pass each threshold's filter, and those of them that earn nearly the best return left."""
+    figure, axes = task_panels(datasets, 3.4)
+    for ax, (name, data) in zip(axes.flat, datasets.items(), strict=False):
+        thresholds = get_task(name).thresholds
+        left = [np.sum(data.episode_costs <= limit) for limit in thresholds]
+        good = [near_best(data, limit, share) for limit in thresholds]
+        ax.bar(range(3), left, color=NEUTRAL, alpha=0.4, label="keep the limit")
+        words = f"and earn at least {share:.0%} of the best that do"
+        ax.bar_label(ax.bar(range(3), good, color=REWARD, label=words), fontsize=13)
+        ax.set_xticks(range(3), [f"{limit:g}" for limit in thresholds])
+        ax.set_xlabel("limit")
+    for ax in axes[:, 0]:
+        ax.set_ylabel("episodes")
+    legend_below(figure, axes[0, 0])
+    return figure
+
+
+@one_figure
+def at_the_wall(push, crossed, bins: int = 8):
+    """Recorded pushes towards the wall (n,) in [-1, 1], and the share of each bin that soon crosses it."""
+    edges = np.linspace(-1, 1, bins + 1)
+    place = np.clip(np.digitize(push, edges) - 1, 0, bins - 1)
+    counts = np.bincount(place, minlength=bins)
+    shares = np.bincount(place, weights=crossed, minlength=bins) / np.maximum(counts, 1)
+    figure, axes = subplots(1, 2, figsize=(12, 4.2))
+    middles, width = (edges[1:] + edges[:-1]) / 2, 0.92 * (edges[1] - edges[0])
+    axes[0].bar(middles, counts, width, color=NEUTRAL)
+    axes[1].bar(middles, shares, width, color=COST)
+    axes[0].set(title="what was tried: recorded steps", yscale="log")
+    axes[1].set(title="what came of it: share that crosses the wall", ylim=(0, 1))
+    for ax in axes:
+        ax.set(xlabel="push: -1 brakes, 1 goes for the wall", xticks=(-1, -0.5, 0, 0.5, 1))
+    return figure
+
+
+@one_figure
+def to_go(steps, masked, continued, level: float):
+    """Mean discounted return-to-go over the step: the recording's end as the end, and as a cut."""
+    figure, ax = subplots(figsize=(11, 4.4))
+    ax.plot(steps, continued, color=REWARD, label="a cut: the robot goes on at its rate")
+    ax.plot(steps, masked, color=COST, label="the end: nothing follows")
+    ax.axhline(level, color=NEUTRAL, linewidth=1.5, label="its mean over the steps")
+    ax.set(xlabel="step", ylabel="discounted return to go", ylim=(0, None))
+    legend_below(figure, ax)
+    return figure

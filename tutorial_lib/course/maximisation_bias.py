@@ -1,0 +1,161 @@
+"""What a maximum does to values learned from recordings: a bandit, and tiny critics on a shipped dataset."""
+
+import copy
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tutorial_lib.agents.cpq import _vae_loss
+from tutorial_lib.config import Config
+from tutorial_lib.data.dataset import Batch, Dataset, sample_batch
+from tutorial_lib.losses import expectile_loss, td_loss, td_target
+from tutorial_lib.networks import ActionDecoder, ActionEncoder, Critics, Value, latent_kl
+from tutorial_lib.tasks import make_env
+
+
+def bandit_value(action):
+    """True mean reward of an action in [-1, 1]: the more the better, until at 0.3 one falls off a cliff."""
+    return np.where(np.asarray(action) < 0.3, 1.0 + np.asarray(action), -1.0)
+
+
+def bandit_logs(rng: np.random.Generator, n: int = 40, noise: float = 0.2):
+    """n recorded actions, careful ones from -0.6 to 0.2, and their noisy rewards; both (n,)."""
+    actions = np.clip(rng.normal(-0.2, 0.15, n), -0.6, 0.2)
+    return actions, bandit_value(actions) + rng.normal(0, noise, n)
+
+
+class Critic:
+    """Twin Q, their Polyak-averaged copies, and V: the library's networks, small enough for a lesson.
+
+    Every network starts near `scale`; observations are standardised as the dataset's are.
+    """
+
+    def __init__(self, dataset: Dataset, scale: float, width: int = 64, seed: int = 0):
+        obs, act, config = dataset.observations.shape[1], dataset.actions.shape[1], Config(hidden_width=width)
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            self.critics = Critics(obs, act, config, scale)
+            self.value = Value(obs, config, scale)
+        self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)
+        self.scale = scale
+        self.mean = torch.tensor(dataset.observations.mean(0))
+        self.std = torch.tensor(dataset.observations.std(0)) + 1e-3
+
+    def twins(self, observations: Tensor, actions: Tensor, networks: Critics | None = None) -> Tensor:
+        """Both Q(s, a): (..., obs) and (..., act) to (2, ...)."""
+        s, a = (self.observed(observations).flatten(0, -2), actions.flatten(0, -2))
+        return (networks or self.critics)(s, a).unflatten(1, actions.shape[:-1])
+
+    def q(self, observations: Tensor, actions: Tensor) -> Tensor:
+        """The smaller of both, (...)."""
+        return self.twins(observations, actions).amin(0)
+
+    def target_q(self, observations: Tensor, actions: Tensor) -> Tensor:
+        """The smaller of both copies, (...): what backups and V look at."""
+        return self.twins(observations, actions, self.target_critics).amin(0)
+
+    def v(self, observations: Tensor) -> Tensor:
+        """V(s): (B, obs) to (B,)."""
+        return self.value(self.observed(observations))
+
+    def observed(self, observations: Tensor) -> Tensor:
+        """Standardised observations, in their shape."""
+        return (observations - self.mean) / self.std
+
+
+class Course(NamedTuple):
+    """How a critic's values went: the mean Q(s, a) of recorded actions, `q` (k,), at `updates` (k,)."""
+
+    updates: np.ndarray
+    q: np.ndarray
+    critic: Critic
+
+
+def train_critic(
+    dataset: Dataset,
+    next_value: Callable[[Critic, Tensor, torch.Generator], Tensor],
+    kappa: float = 0.7,
+    gamma: float = 0.99,
+    updates: int = 1200,
+    seed: int = 0,
+    learning_rate: float = 1e-3,
+    tau: float = 0.2,
+) -> Course:
+    """Trains Q towards r + gamma m next_value(critic, s', generator), and V to the kappa-expectile of Q.
+
+    m is 0 after terminals and, as in this project's default, after time limits. The copies follow 40 times
+    faster than IQL's (tau): what goes wrong goes wrong within a minute.
+    Batches of 256; the course is noted every 20 updates.
+    """
+    data, generator = dataset.tensors(), torch.Generator().manual_seed(seed)
+    critic = Critic(dataset, scale=1 / (1 - gamma), seed=seed)
+    online = [*critic.critics.parameters(), *critic.value.parameters()]
+    optimiser = torch.optim.Adam(online, learning_rate)
+    notes = []
+    for update in range(updates + 1):
+        batch = Batch(*(field[0] for field in sample_batch(data, 256, [generator])))
+        with torch.no_grad():
+            mask = (1 - batch.terminals) * (1 - batch.timeouts)
+            following = next_value(critic, batch.next_observations, generator)
+            target = td_target(batch.rewards, gamma, following, mask)
+            now = critic.target_q(batch.observations, batch.actions)
+        q = critic.twins(batch.observations, batch.actions)
+        if update % 20 == 0:
+            notes.append((update, q.detach().mean().item()))
+        loss = td_loss(target, q) + expectile_loss(now, critic.v(batch.observations), kappa)
+        optimiser.zero_grad()
+        (loss / critic.scale**2).backward()
+        optimiser.step()
+        with torch.no_grad():
+            torch._foreach_lerp_(
+                list(critic.target_critics.parameters()), list(critic.critics.parameters()), tau
+            )
+    return Course(*np.array(notes).T, critic)
+
+
+def play_greedy(critic: Critic, task, gamma: float = 0.99, seed: int = 0, points: int = 21):
+    """One episode of the action that Q values highest, of a grid over [-1, 1]^2.
+
+    Returns Q's claim at the first step and the discounted sum of the rewards that came of it.
+    """
+    line = torch.linspace(-1, 1, points)
+    grid = torch.cartesian_prod(*[line] * task.act_dim)
+    env = make_env(task)
+    observation, _ = env.reset(seed=seed)
+    claim, earned = None, 0.0
+    for t in range(task.horizon):
+        with torch.no_grad():
+            q = critic.q(torch.tensor(observation).expand(len(grid), -1), grid)
+        claim = q.max().item() if claim is None else claim
+        observation, reward, terminated, *_ = env.step(grid[q.argmax()].numpy())
+        earned += gamma**t * reward
+        if terminated:
+            break
+    env.close()
+    return claim, earned
+
+
+def latent_divergences(dataset: Dataset, updates: int = 400, width: int = 200, n: int = 2000, seed: int = 0):
+    """Would CPQ's VAE notice? The KL divergences (n,) that it gives recorded actions, and uniformly random
+    ones in the same states, after so many updates of its own loss at batch size 256.
+    """
+    data, generator = dataset.tensors(), torch.Generator().manual_seed(seed)
+    s = (data.observations - data.observations.mean(0)) / (data.observations.std(0) + 1e-3)
+    a, sizes = data.actions, (s.shape[1], data.actions.shape[1])
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        encoder, decoder = ActionEncoder(*sizes, width, 2), ActionDecoder(*sizes, width, 2)
+    optimiser = torch.optim.Adam([*encoder.parameters(), *decoder.parameters()], 1e-3)
+    for _ in range(updates):
+        rows = torch.randint(len(s), (256,), generator=generator)
+        noise = torch.randn(256, 2 * sizes[1], generator=generator)
+        optimiser.zero_grad()
+        _vae_loss(encoder, decoder, s[rows], a[rows], noise).backward()
+        optimiser.step()
+    rows = torch.randint(len(s), (n,), generator=generator)
+    random = 2 * torch.rand(n, sizes[1], generator=generator) - 1
+    with torch.no_grad():
+        return tuple(latent_kl(*encoder(s[rows], x)).numpy() for x in (a[rows], random))

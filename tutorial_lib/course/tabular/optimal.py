@@ -1,0 +1,115 @@
+"""The best policy under a limit: in expectation by linear programmes, in every episode by recursion."""
+
+import dataclasses
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import linprog
+
+from tutorial_lib.course.tabular.cmdp import CMDP, Episodes, draw
+
+
+class Solution(NamedTuple):
+    """An optimal policy, (S, A), with what it earns and costs, and the price of its limit.
+
+    `price` is the limit's Lagrange multiplier: what one more unit of limit would earn. `occupancy` is the
+    policy's own, (S, A). With a horizon both are (T, S, A). Where the policy never comes, it is uniform.
+    """
+
+    policy: np.ndarray
+    reward: float
+    cost: float
+    price: float
+    occupancy: np.ndarray
+
+
+def solve(cmdp: CMDP, limit: float = np.inf) -> Solution:
+    """Eq. 2 exactly, as a linear programme over occupancies (Altman 1999).
+
+    Raises ValueError, which names the least achievable cost, if no policy keeps the limit.
+    """
+    return _solve(cmdp.transitions, cmdp.rewards, cmdp.costs, cmdp.initial, cmdp.gamma, limit)
+
+
+def least_cost(cmdp: CMDP) -> float:
+    """The least discounted cost that any policy achieves: a limit below it is infeasible."""
+    return solve(dataclasses.replace(cmdp, rewards=-cmdp.costs)).cost
+
+
+def solve_episodes(cmdp: CMDP, horizon: int, limit: float = np.inf) -> Solution:
+    """Eq. 1 exactly: the best expected sum of rewards of `horizon` steps, undiscounted, under a limit on the
+    expected sum of costs. The policy, (horizon, S, A), depends on the step. Raises ValueError as `solve`.
+    """
+    states, actions = cmdp.rewards.shape
+    unrolled = np.zeros((horizon, states, actions, horizon, states))
+    for t in range(horizon - 1):  # the last step leads nowhere
+        unrolled[t, :, :, t + 1] = cmdp.transitions
+    unrolled = unrolled.reshape(horizon * states, actions, horizon * states)
+    initial = np.concatenate([cmdp.initial, np.zeros((horizon - 1) * states)])
+    rewards, costs = (np.tile(signal, (horizon, 1)) for signal in (cmdp.rewards, cmdp.costs))
+    found = _solve(unrolled, rewards, costs, initial, 1.0, limit)
+    shape = horizon, states, actions
+    return found._replace(policy=found.policy.reshape(shape), occupancy=found.occupancy.reshape(shape))
+
+
+def _solve(transitions, rewards, costs, initial, gamma, limit) -> Solution:
+    states, actions = rewards.shape
+    leaving = np.repeat(np.eye(states), actions, axis=0)  # (S A, S): a visit of (s, a) leaves s ...
+    flow = (leaving - gamma * transitions.reshape(-1, states)).T  # ... and comes discounted to the next state
+    limited = {"A_ub": costs.reshape(1, -1), "b_ub": [limit]} if np.isfinite(limit) else {}
+    found = linprog(-rewards.ravel(), **limited, A_eq=flow, b_eq=initial, method="highs")
+    if found.status == 2:
+        least = linprog(costs.ravel(), A_eq=flow, b_eq=initial, method="highs").fun
+        raise ValueError(f"no policy keeps the limit {limit:g}: the least achievable cost is {least:.6g}")
+    if found.status:
+        raise ArithmeticError(found.message)
+    visits = found.x.reshape(states, actions).clip(min=0)
+    total = visits.sum(1, keepdims=True)
+    seen = total > 1e-9
+    policy = np.where(seen, visits / np.where(seen, total, 1), 1 / actions)
+    price = float(-found.ineqlin.marginals[0]) if limited else 0.0
+    return Solution(policy, float((rewards * visits).sum()), float((costs * visits).sum()), price, visits)
+
+
+def budget_optimum(cmdp: CMDP, horizon: int, budget: int, stopped: float = 0.0):
+    """The best that keeps a budget in *every* episode: exact, by recursion over (steps, budget, state).
+
+    Undiscounted, as eq. 1, with costs that are whole numbers. Returns values (T+1, budget+1, S), the expected
+    reward from step t on with b left to spend, and the actions taken, (T, budget+1, S) int. An action that
+    costs more than b is not to be had. Where none is, the episode is stopped: the value is `stopped` and the
+    action -1. With `stopped=-inf` that must never happen, and -inf marks what no policy can keep for certain.
+    Raises ValueError for costs that are not whole or negative.
+    """
+    if (cmdp.costs < 0).any() or (cmdp.costs % 1).any():
+        raise ValueError("a budget is counted in whole costs: they must be 0, 1, 2, ...")
+    states, actions = cmdp.rewards.shape
+    values = np.zeros((horizon + 1, budget + 1, states))
+    policy = np.full((horizon, budget + 1, states), -1)
+    reach = cmdp.transitions > 0
+    for t in reversed(range(horizon)):
+        for b in range(budget + 1):
+            left = b - cmdp.costs.astype(int)  # (S, A)
+            then = values[t + 1, left.clip(min=0)]  # (S, A, S)
+            expected = np.where(reach, cmdp.transitions * np.where(reach, then, 0), 0).sum(-1)
+            q = np.where(left >= 0, cmdp.rewards + expected, -np.inf)
+            best = q.argmax(1)
+            values[t, b] = np.where(left.max(1) >= 0, q.max(1), stopped)
+            policy[t, b] = np.where(left.max(1) >= 0, best, -1)
+    return values, policy
+
+
+def play_budget(cmdp: CMDP, policy: np.ndarray, n: int, rng: np.random.Generator) -> Episodes:
+    """Play n episodes of `budget_optimum`'s policy, from its full budget. A stopped one earns and costs 0."""
+    horizon, levels, _ = policy.shape
+    states, actions = np.zeros((2, n, horizon), int)
+    rewards, costs = np.zeros((2, n, horizon))
+    state, left, runs = draw(np.tile(cmdp.initial, (n, 1)), rng), np.full(n, levels - 1), np.ones(n, bool)
+    for t in range(horizon):
+        action = policy[t, left, state]
+        runs = runs & (action >= 0)
+        states[:, t], actions[:, t] = state, np.where(runs, action, -1)
+        rewards[:, t] = np.where(runs, cmdp.rewards[state, action], 0)
+        costs[:, t] = np.where(runs, cmdp.costs[state, action], 0)
+        left = left - costs[:, t].astype(int)
+        state = np.where(runs, draw(cmdp.transitions[state, action], rng), state)
+    return Episodes(states, actions, rewards, costs)

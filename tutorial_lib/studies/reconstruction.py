@@ -1,0 +1,115 @@
+"""How large must the reconstruction model be, and what noise should it train on? A CSV of measured errors.
+
+`python -m tutorial_lib.reconstruction_study` makes data/results/reconstruction.csv in about half an hour.
+"""
+
+import dataclasses
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import torch
+
+from tutorial_lib.config import Config, get_profile
+from tutorial_lib.costs.reconstruction import (
+    CostReconstruction,
+    episode_sums,
+    input_noise,
+    random_sums,
+    train_reconstruction,
+)
+from tutorial_lib.data.dataset import Dataset
+from tutorial_lib.data.sources import SHIPPED_DATA, load_dataset
+from tutorial_lib.files import written_whole
+from tutorial_lib.tasks import Task, get_task
+
+PATH = SHIPPED_DATA / "results" / "reconstruction.csv"
+SIZES = {"linear": (0, 0), "1 x 16": (1, 16), "2 x 64": (2, 64), "3 x 128": (3, 128), "5 x 512": (5, 512)}
+"""Hidden layers and width. The last is the paper's, '2 x 64' is profile small's."""
+NOISES = (0.0, 0.1, 0.2, 0.3, 0.5, 1.0, 2.0, 4.0)
+"""Table 2's levels."""
+STEPS = 2_000
+"""Iterations of Algorithm 1 for every size, at a batch of 256."""
+
+
+def crm_config(size: str, noise: float, noise_rate: float = 0.0, steps: int = STEPS) -> Config:
+    """The configuration of a model of this size, trained on this noise."""
+    layers, width = SIZES[size]
+    return dataclasses.replace(
+        get_profile("small"),
+        crm="mlp" if layers else "linear",
+        crm_layers=layers,
+        crm_width=width,
+        crm_steps=steps,
+        crm_noise=noise,
+        crm_noise_rate=noise_rate,
+    )
+
+
+def errors(
+    model: CostReconstruction, task: Task, dataset: Dataset, config: Config, n: int = 20_000, seed: int = 1
+) -> dict[str, float]:
+    """Root mean squared errors, in unsafe steps, where the inputs have the noise of `config`.
+
+    `random` is that on n random sequences which no training has seen; `episodes` that on the dataset's.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    std = input_noise(task, config)
+    found = {}
+    for name, (x, y) in {
+        "random": random_sums(task, n, np.random.default_rng(seed)),
+        "episodes": episode_sums(dataset, task),
+    }.items():
+        noisy = torch.as_tensor(x) + std * torch.randn(x.shape, generator=generator, dtype=torch.float64)
+        with torch.no_grad():
+            rebuilt = model(noisy.float()).double().numpy()
+        found[name] = float(np.sqrt(np.mean((rebuilt - y) ** 2)))
+    return found
+
+
+def settings() -> Iterator[tuple[str, str, float, float, list[tuple[float, float]]]]:
+    """(task, size, training noise, its rate, [(test noise, its rate)]), small models first."""
+    tests = [(0.0, 0.0), (0.1, 0.0), (0.0, 0.01)]
+    for size in SIZES:
+        for noise, rate in tests:
+            yield "CarCircle", size, noise, rate, tests
+        if size in ("linear", "2 x 64"):
+            for noise in NOISES[2:]:
+                yield "CarCircle", size, noise, 0.0, [(noise, 0.0)]
+
+
+def run(path: Path | None = PATH, chosen=None, steps: int = STEPS) -> pd.DataFrame:
+    """Train and test every setting (default: all); `path` gets the table as it grows, unless it is None."""
+    rows = []
+    for name, size, noise, rate, tests in chosen or settings():
+        task, dataset = get_task(name), load_dataset(name)
+        config = crm_config(size, noise, rate, steps)
+        model = train_reconstruction(task, config, dataset, progress=False)
+        parameters = sum(p.numel() for p in model.parameters())
+        for test_noise, test_rate in tests:
+            test = dataclasses.replace(config, crm_noise=test_noise, crm_noise_rate=test_rate)
+            found = errors(model, task, dataset, test)
+            rows.append(
+                {
+                    "task": name,
+                    "size": size,
+                    "parameters": parameters,
+                    "steps": steps if config.crm == "mlp" else 0,
+                    "noise": noise,
+                    "noise_rate": rate,
+                    "test_noise": test_noise,
+                    "test_noise_rate": test_rate,
+                    "rmse_random": round(found["random"], 4),
+                    "rmse_episodes": round(found["episodes"], 4),
+                }
+            )
+        if path is not None:
+            with written_whole(path) as temporary:
+                pd.DataFrame(rows).to_csv(temporary, index=False)
+    return pd.DataFrame(rows)
+
+
+if __name__ == "__main__":
+    torch.set_num_threads(1)
+    run()

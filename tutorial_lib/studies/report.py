@@ -1,0 +1,242 @@
+"""Tables made from files: the datasheet of the shipped data and the results, in the Markdown that shows them.
+
+A page keeps a pair of comments, `<!-- NAME:begin -->` and `<!-- NAME:end -->`; what stands between them
+is written here and nowhere else, and a test fails where it is out of date.
+"""
+
+import hashlib
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from tutorial_lib.config import get_profile
+from tutorial_lib.costs.conditioning import threshold_set
+from tutorial_lib.data.recordings import best_left
+from tutorial_lib.data.sources import SHIPPED_DATA, load_dataset, shipped_tasks
+from tutorial_lib.files import written_whole
+from tutorial_lib.scores import with_scores
+from tutorial_lib.studies.figures import cost_return_plane, expected_costs, study_figure
+from tutorial_lib.studies.grids import STUDIES, get_study
+from tutorial_lib.studies.paper import CLAIMS, TABLE1
+from tutorial_lib.studies.results import (
+    RESULTS,
+    SCORES,
+    load_results,
+    not_run,
+    options_of,
+    over_seeds,
+    verdicts,
+)
+from tutorial_lib.style import Picture
+from tutorial_lib.tasks import DSRL_FRONTIER, TASKS, get_task
+
+ROOT = SHIPPED_DATA.parent
+
+
+def datasheet() -> str:
+    """One row per shipped dataset: size, episodes, ranges, how it was made, checksum."""
+    rows = []
+    for name in shipped_tasks():
+        path, data = SHIPPED_DATA / f"{name}.hdf5", load_dataset(name)
+        costs, returns = data.episode_costs, data.episode_returns
+        minutes = int(data.attributes["wall_seconds"]) // 60
+        rows.append(
+            {
+                "file": f"`{path.name}`",
+                "MB": f"{path.stat().st_size / 1e6:.1f}",
+                "episodes": f"{data.num_episodes} of {data.attributes['collected_episodes']}",
+                "transitions": f"{len(data):,}",
+                "cost": f"{costs.min():.0f} to {costs.max():.0f}, mean {costs.mean():.0f}",
+                "return": f"{returns.min().round() + 0:.0f} to {returns.max():.0f}",
+                "made with": f"`{data.attributes['made_by']}`, {minutes} min",
+                "SHA-256": f"`{hashlib.sha256(path.read_bytes()).hexdigest()}`",
+            }
+        )
+    return markdown(pd.DataFrame(rows))
+
+
+def frontier() -> str:
+    """The best return at a cost of at most so much, ours against DSRL's."""
+    rows = []
+    for name in shipped_tasks():
+        data, points = load_dataset(name), DSRL_FRONTIER[name]
+        for (cost, dsrl), ours in zip(points.items(), best_left(data, list(points))[1], strict=True):
+            row = {"task": name, "cost at most": cost, "DSRL": dsrl, "ours": f"{ours:.0f}"}
+            rows.append(row | {"ours / DSRL": f"{ours / dsrl:.2f}"})
+    return markdown(pd.DataFrame(rows))
+
+
+def results_table(results: pd.DataFrame | None = None) -> str:
+    """C2IQL per task: scores per threshold, 95% intervals over seeds; the paper's mean beside ours."""
+    results = load_results("table1") if results is None else results
+    rows = []
+    for task, part in results[results["algorithm"] == "C2IQL"].groupby("task", sort=False):
+        row = {"task": task, "seeds": part["seed"].nunique()}
+        for _, line in over_seeds(part, ("threshold",)).iterrows():
+            limit = get_task(task).cost_limit_names[line["threshold"]]
+            row[f"{limit} limit: reward / cost"] = " / ".join(
+                f"{line[name]:.2f} [{line[f'{name}_low']:.2f}, {line[f'{name}_high']:.2f}]" for name in SCORES
+            )
+        row["mean: reward / cost"] = _pair(*over_seeds(part).loc[0, list(SCORES)])
+        row["the paper's, on DSRL's data"] = _pair(*TABLE1["C2IQL"][task])
+        rows.append(row)
+    return markdown(pd.DataFrame(rows))
+
+
+def baselines_table() -> str:
+    """Our algorithms on all tasks, what was not run, and the paper's: mean reward / mean cost."""
+    results = load_results("table1")
+    if not len(results):
+        return f"*{not_run('table1').capitalize()}.*"
+    found = over_seeds(results).set_index(["algorithm", "task"])
+    run = found.index.get_level_values(0).unique()
+    missing = [name for name in ("BC-All", "BC-Safe", *TABLE1) if name not in run]
+    rows = []
+    for name in run:
+        row = {"": name, "seeds": found.loc[name, "seeds"].min()}
+        for task in TASKS:
+            key = (name, task)
+            row[task] = _pair(*found.loc[key, list(SCORES)]) if key in found.index else "not run"
+        rows.append(row)
+    if missing:
+        rows.append({"": ", ".join(missing), "seeds": "-"} | dict.fromkeys(TASKS, "not run"))
+    for name in ("C2IQL", *(name for name in run if name in TABLE1 and name != "C2IQL")):
+        row = {"": f"the paper's {name}, on DSRL's data", "seeds": 5}
+        rows.append(row | {task: _pair(*TABLE1[name][task]) for task in TASKS})
+    return markdown(pd.DataFrame(rows))
+
+
+def _pair(reward: float, cost: float) -> str:
+    text = f"{round(reward, 2) + 0:.2f} / {cost:.2f}"  # + 0: no minus before a zero
+    return f"*{text}*" if round(cost, 2) > 1 else text
+
+
+# --- Studies ---
+
+
+def study_table(results: pd.DataFrame) -> pd.DataFrame:
+    """One row per task and variant: reward / cost at each limit; mean and standard deviation over seeds."""
+    by = ["task", "algorithm", *options_of(results)]
+    rows = []
+    for key, part in results.groupby(by, sort=False, dropna=False):
+        row = dict(zip(by, key, strict=True)) | {"seeds": part["seed"].nunique()}
+        if len(by) > 2 and results["algorithm"].nunique() == 1:
+            del row["algorithm"]
+        if "reconstruction_error" in part:
+            row["error of the model"] = f"{part['reconstruction_error'].mean():.1f}"
+        limits = with_scores(part).groupby("threshold")[list(SCORES)].mean()
+        for limit, scores in limits.iterrows():
+            word = get_task(row["task"]).cost_limit_names.get(limit)
+            row[f"{word} limit" if word else f"limit {limit:g}"] = _pair(*scores)
+        mean = over_seeds(part, ("task",)).iloc[0]
+        for score, word in zip(SCORES, ("reward", "cost"), strict=True):
+            spread = "" if row["seeds"] == 1 else f" ± {mean[f'{score}_std']:.2f}"
+            row[word] = f"{mean[score]:.2f}{spread}"
+        rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def paper_profile_table() -> str:
+    """The runs of profile `paper`, by the updates that they had made, and `small` on the same data."""
+    paper, small = load_results("paper-profile"), load_results("table1")
+    if not len(paper):
+        return "*Not run.*"
+    same = small["task"].isin(paper["task"]) & (small["algorithm"] == "C2IQL")
+    paper = paper.sort_values(["cost_critics", "updates"], kind="stable")
+    both = pd.concat([paper, small[same].assign(cost_critics=get_profile("small").cost_critics)])
+    words = both["profile"] + ", " + both["updates"].map("{:,} updates".format)
+    table = markdown(study_table(both.assign(run=words)))
+    return f"{table}\n\n![what the critics expect](results/paper-profile.png)"
+
+
+def write_paper_profile() -> Path | None:
+    """Draw what the critics of profile `paper` come to expect; None where it was not run."""
+    log = load_results("paper-profile-training")
+    if not len(log):
+        return None
+    task = get_task(load_results("paper-profile")["task"].iloc[0])
+    told = threshold_set(task, with_zero=get_profile("paper").zero_threshold)
+    figure = expected_costs(log, load_dataset(task.name).episode_costs.mean(), np.isinf(told).mean())
+    return drawn(figure, RESULTS / "paper-profile.png")
+
+
+def study_section(name: str) -> str:
+    """A study's question, table, figure and verdicts on the paper's claims, or that it was not run."""
+    results, lines = load_results(name), [f"### {name}", "", get_study(name).question, ""]
+    if not len(results):
+        return "\n".join([*lines, f"*{not_run(name).capitalize()}.*"])
+    lines += [markdown(study_table(results)), ""]
+    if (RESULTS / f"{name}.png").exists():
+        lines += [f"![{name}](results/{name}.png)", ""]
+    claims = [claim for claim in CLAIMS if claim.study == name]
+    if claims:
+        lines += [markdown(verdicts(claims, results)), ""]
+    return "\n".join(lines).rstrip()
+
+
+def studies_text() -> str:
+    """Every study's section."""
+    return "\n\n".join(study_section(name) for name in STUDIES)
+
+
+def write_study(name: str) -> Path | None:
+    """Draw a study's figure beside its results; None where it was not run."""
+    get_study(name)  # raises ValueError where there is none
+    results = load_results(name)
+    if not len(results):
+        return None
+    return drawn(study_figure(name, results), RESULTS / f"{name}.png")
+
+
+# --- Pages ---
+
+
+def markdown(table: pd.DataFrame) -> str:
+    """A table in Markdown."""
+    lines = [table.columns, ["---"] * len(table.columns), *table.astype(object).fillna("").astype(str).values]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def between_marks(page: str, name: str, text: str) -> str:
+    """`page` with `text` between its marks called `name`. Raises ValueError where it has none."""
+    begin, end = f"<!-- {name}:begin -->", f"<!-- {name}:end -->"
+    if begin not in page or end not in page:
+        raise ValueError(f"the page has no marks {begin} and {end}")
+    head, rest = page.split(begin, 1)
+    return head + begin + "\n" + text + "\n" + end + rest.split(end, 1)[1]
+
+
+def pages() -> dict[Path, str]:
+    """Every page that holds made tables, as it should read now."""
+    data, readme = SHIPPED_DATA / "README.md", ROOT / "README.md"
+    text = data.read_text()
+    made = {"datasheet": datasheet, "frontier": frontier, "studies": studies_text}
+    made["paper-profile"] = paper_profile_table
+    for name, table in made.items():
+        text = between_marks(text, name, table())
+    front = readme.read_text()
+    front_tables = (("results", results_table), ("baselines", baselines_table))
+    for name, table in front_tables:
+        front = between_marks(front, name, table())
+    return {data: text, readme: front}
+
+
+def write() -> list[Path]:
+    """Bring the pages, the pictures of the datasets and the studies' figures up to date. Returns them all."""
+    figures = [path for path in (*map(write_study, STUDIES), write_paper_profile()) if path]
+    written = pages()
+    for path, text in written.items():
+        with written_whole(path) as temporary:
+            temporary.write_text(text)
+    pictures = [
+        drawn(cost_return_plane(load_dataset(name), get_task(name)), SHIPPED_DATA / "planes" / f"{name}.png")
+        for name in shipped_tasks()
+    ]
+    return [*written, *pictures, *figures]
+
+
+def drawn(figure: Picture, path: Path) -> Path:
+    with written_whole(path) as temporary:
+        temporary.write_bytes(figure.small_png())
+    return path
