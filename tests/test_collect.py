@@ -1,32 +1,42 @@
-"""Collection: the thinning by brute force, the priced reward by hand, a run killed and resumed.
+"""Collection: thinning by brute force, charges and the multiplier by hand, runs that are killed and resumed.
 
 Run as a script, this file is the process that gets killed.
 """
 
 import functools
+import json
 import math
 import os
 import signal
 import subprocess
 import sys
 from collections import Counter
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import gymnasium
 import numpy as np
 import pytest
-from safetensors.numpy import load_file
+from safetensors import safe_open
+from safetensors.numpy import load_file, save_file
 
 from tutorial_lib.data import collect as collecting
-from tutorial_lib.data.collect import RECIPES, PricedCost, Recipe, along_own_axes, run_ppo, thin
+from tutorial_lib.data import ppo
+from tutorial_lib.data.behaviour import KINDS, LagrangianCost, PricedCost, RecordedTask, along_own_axes
+from tutorial_lib.data.collect import SOURCES, read_source, thin
+from tutorial_lib.data.dataset import KEYS
 from tutorial_lib.data.hdf5 import read_dataset
+from tutorial_lib.data.ppo import load_ppo, make_ppo, run_ppo, save_ppo
+from tutorial_lib.data.schedule import Schedule
 from tutorial_lib.tasks import TASKS
+from tutorial_lib.tasks.recipes import RECIPES, Recipe
 
 ROOT = Path(__file__).parents[1]
-BALL = TASKS["BallRun"]  # T = 100
-SLICE = 2048  # an episode of 100 steps in each of the 16 environments, and a piece of the next
-RECIPE = Recipe(episodes=20, steps=2 * SLICE, batch_steps=SLICE)
+BALL = TASKS["BallRun"]  # T = 100, cost range 80
+BATCH = 2048  # an episode of 100 steps in each of the 16 environments, and a part of the next
+SLICE = 2 * BATCH  # the multiplier looks at the episodes of the first batch
+RECIPE = Recipe(episodes=20, steps=2 * SLICE, batch_steps=BATCH, limit_falls=(0.0, 0.01))
 
 
 # --- Thinning ---
@@ -39,7 +49,7 @@ def plane(seed, count=3_000):
     return costs, rng.normal(500, 250, count) + 4 * costs
 
 
-def cells(costs, returns, kept, max_cost, low, high):
+def count_bins(costs, returns, kept, max_cost, low, high):
     """How many of some episodes lie in each (column, row) of the grid, counted one by one."""
     counts = Counter()
     for i in kept:
@@ -59,8 +69,8 @@ def test_thinning_is_even_over_cost_and_within_a_cost_over_return(seed, n):
     assert set(kept) <= set(allowed) and len(allowed) < len(costs)
 
     low, high = min(returns[allowed]), max(returns[allowed])
-    there = cells(costs, returns, allowed, 80, low, high)
-    taken = cells(costs, returns, kept, 80, low, high)
+    there = count_bins(costs, returns, allowed, 80, low, high)
+    taken = count_bins(costs, returns, kept, 80, low, high)
     columns = Counter()
     for (column, _), count in there.items():
         columns[column] += count
@@ -71,35 +81,35 @@ def test_thinning_is_even_over_cost_and_within_a_cost_over_return(seed, n):
         rows = [row for c, row in there if c == column]
         assert sum(taken[column, row] for row in rows) == min(k, count)
         most = max(taken[column, row] for row in rows)
-        for row in rows:  # a cell gives less than another only where it has no more, or at the last turn
+        for row in rows:  # a bin gives fewer than another only where it has no more, or at the last turn
             assert taken[column, row] in (there[column, row], most, most - 1)
     assert min(n, len(allowed)) <= len(kept) < min(n, len(allowed)) + len(columns)
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_thinning_keeps_the_cheapest_episode_of_the_frontier_in_every_cell_it_takes_from(seed):
+def test_thinning_keeps_the_cheapest_episode_of_the_frontier_in_every_bin_it_takes_from(seed):
     rng = np.random.default_rng(seed)
     costs = rng.integers(0, 81, 600)
-    returns = 5 * costs + rng.uniform(0, 100, 600)  # what is spent earns, so nearly every cost has its best
+    returns = 5 * costs + rng.uniform(0, 100, 600)  # costs earn, so nearly every cost has a frontier episode
     kept = set(thin(costs, returns, 200, max_cost=80, max_return=1_000).tolist())
     everyone, low, high = range(600), returns.min(), returns.max()
     frontier = [
         i for i in everyone if not any(costs[j] <= costs[i] and returns[j] > returns[i] for j in everyone)
     ]
 
-    def cell(i):
+    def bin_of(i):
         return min(int(costs[i] / 4), 19), min(int((returns[i] - low) / (high - low) * 20), 19)
 
     first = {}
     for i in sorted(frontier, key=lambda i: costs[i]):
-        first.setdefault(cell(i), i)
-    taken = {cell(i) for i in kept}
+        first.setdefault(bin_of(i), i)
+    taken = {bin_of(i) for i in kept}
     assert sum(place in taken for place in first) > 20
     assert all(i in kept for place, i in first.items() if place in taken)
 
 
-def test_thinning_draws_at_random_within_a_cell_and_alike_every_time():
-    costs, returns = np.zeros(1_000), np.full(1_000, 7.0)  # all in one cell
+def test_thinning_draws_at_random_within_a_bin_and_the_same_every_time():
+    costs, returns = np.zeros(1_000), np.full(1_000, 7.0)  # all in one bin
     kept = thin(costs, returns, 100, 80, 1_000, seed=1)
     assert len(kept) == 100 and 300 < kept.mean() < 700
     assert kept.tolist() == thin(costs, returns, 100, 80, 1_000, seed=1).tolist()
@@ -111,11 +121,18 @@ def test_to_keep_no_episode_is_refused():
         thin(np.zeros(5), np.zeros(5), 0, 10, 10)
 
 
-def test_the_bounds_themselves_are_within():
+def test_that_no_episode_is_left_is_refused_in_one_line():
+    with pytest.raises(
+        ValueError, match="^none of 2 episodes has a cost of at most 10 and .* 7: collect more$"
+    ):
+        thin(np.array([11.0, 5.0]), np.array([0.0, 8.0]), 1, 10, 7)
+
+
+def test_the_highest_cost_and_return_themselves_are_kept():
     assert thin(np.array([80.0, 80.5, 10.0]), np.array([5.0, 5.0, 1_000.0]), 9, 80, 1_000).tolist() == [0, 2]
 
 
-# --- The priced reward ---
+# --- What agents are charged, and what they observe ---
 
 
 class Scripted(gymnasium.Env):
@@ -134,8 +151,8 @@ class Scripted(gymnasium.Env):
         return np.full(7, self.t, np.float32), 2.0, False, last, {"cost": self.costs[self.t - 1]}
 
 
-def priced(costs, recipe, seed=0, price_scale=1.0):
-    env = PricedCost(BALL, recipe, np.random.default_rng(seed), episodes := [])
+def scripted(kind, costs, recipe, seed=0, price_scale=1.0):
+    env = KINDS[kind](BALL, recipe, np.random.default_rng(seed), episodes := [])
     env.env.close()
     env.env, env.price_scale = Scripted(costs), price_scale
     return env, episodes
@@ -154,7 +171,7 @@ def rewards_of(env):
 def test_an_unsafe_step_costs_its_price_once_the_allowance_is_used_up():
     """BallRun's best return is 1327.4456 in 100 steps: a reward of 2 is worth 200 / 1327.4456."""
     two_free = Recipe(episodes=1, prices=(0.1, 0.5), allowance_share=1.0, allowances=(2 / 80, 2 / 80))
-    env, episodes = priced([1, 0, 1, 1, 0, 1], two_free, price_scale=0.6)
+    env, episodes = scripted("priced", [1, 0, 1, 1, 0, 1], two_free, price_scale=0.6)
     seen, rewards = rewards_of(env)
     r = 200 / 1327.4456
     assert rewards == pytest.approx([r, r, r, r - 0.3, r, r - 0.3])  # 0.3 = 0.5 * 0.6
@@ -171,7 +188,7 @@ def test_an_unsafe_step_costs_its_price_once_the_allowance_is_used_up():
 
 def test_prices_and_allowances_are_drawn_from_their_ranges():
     recipe = Recipe(episodes=1, prices=(0.1, 10.0), allowance_share=0.25, allowances=(-0.5, 1.0))
-    env, _ = priced([1.0], recipe)
+    env, _ = scripted("priced", [1.0], recipe)
     draws = [(math.exp(x[-2]), x[-1] * 80 / 2) for x in (env.reset()[0] for _ in range(3_000))]
     prices = np.array([price for price, _ in draws])
     free = np.array([allowance for _, allowance in draws])
@@ -186,8 +203,19 @@ def test_prices_and_allowances_are_drawn_from_their_ranges():
 
 
 def test_while_unsafe_steps_are_free_nothing_is_charged():
-    env, _ = priced([1, 1], Recipe(episodes=1, allowance_share=0.0), price_scale=0.0)
+    env, _ = scripted("priced", [1, 1], Recipe(episodes=1, allowance_share=0.0), price_scale=0.0)
     assert rewards_of(env)[1] == pytest.approx([200 / 1327.4456] * 2)
+
+
+def test_a_lagrangian_agent_pays_the_multiplier_for_the_cost_and_does_not_observe_it():
+    env, episodes = scripted("lagrangian", [1, 0, 1, 0.5], Recipe(episodes=1), price_scale=0.7)
+    assert isinstance(env, LagrangianCost) and env.observation_space.shape == (7,)
+    seen, rewards = rewards_of(env)
+    r = 200 / 1327.4456
+    assert rewards == pytest.approx([r - 0.7, r, r - 0.7, r - 0.35])
+    assert [x.tolist() for x in seen] == [[t] * 7 for t in range(5)]  # nothing is appended
+    (episode,) = episodes
+    assert episode["rewards"].tolist() == [2.0] * 4 and episode["costs"].tolist() == [1, 0, 1, 0.5]
 
 
 # --- The robot's own axes ---
@@ -224,108 +252,372 @@ def test_an_ant_that_starts_along_the_circle_has_the_centre_on_its_right():
         assert env.observation_space.contains(seen)
         distance = math.hypot(*env.env.position)
         assert 2 <= distance <= 4
-        assert seen[9:12] == pytest.approx([0, 0, 1], abs=0.01)  # the sky is above
-        assert seen[12:15] == pytest.approx([0, distance / 10, 0], abs=0.01)  # the centre is opposite
+        assert seen[9:12] == pytest.approx([0, 0, 1], abs=0.01)  # upwards is upwards
+        assert seen[12:15] == pytest.approx([0, distance / 10, 0], abs=0.01)  # the centre of the circle
         assert seen.shape == (34 + 2 + 2,) and env.observation.shape == (34,)  # which is what is recorded
     env.close()
+
+
+# --- The schedule ---
+
+
+def at(schedule, steps):
+    """The price scale that the schedule sets before the batch that begins after so many steps of a slice."""
+    scales = []
+    env = SimpleNamespace(set_attr=lambda name, value: scales.append((name, value)))
+    schedule.model = SimpleNamespace(num_timesteps=steps, env=env)
+    schedule.on_rollout_start()
+    ((name, value),) = scales
+    assert name == "price_scale"
+    return value
+
+
+def episode_of(cost, steps=100):
+    return {"costs": np.array([1.0] * cost + [0.0] * (steps - cost))}
+
+
+def test_the_multiplier_follows_costs_above_the_limit_by_hand():
+    """Cost range 80, limit 80 until half of the run and 0 from then on, integral of at most 0.15."""
+    recipe = Recipe(episodes=1, steps=1_000, limit_falls=(0.5, 0.5001), prices=(0.1, 0.15))
+    schedule = Schedule(BALL, recipe, "lagrangian", episodes := [])
+    assert at(schedule, 0) == 0  # no episode yet
+    episodes += [episode_of(30), episode_of(50)]
+    assert at(schedule, 100) == 0  # v = (40 - 80) / 80: nothing is below zero
+    episodes += [episode_of(40)]
+    assert at(schedule, 600) == pytest.approx(1.1)  # v = 1/2: integral 0.2 v = 0.1, and 2 v = 1
+    assert at(schedule, 700) == pytest.approx(1.1)  # no new episode: as it was
+    episodes += [episode_of(0), episode_of(0)]
+    assert at(schedule, 800) == pytest.approx(0.1)  # v = 0: the integral stays
+    episodes += [episode_of(80)]
+    assert at(schedule, 900) == pytest.approx(2.15)  # v = 1: 0.1 + 0.2 is more than 0.15
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("task", ["BallRun", "AntCircle"])
+def test_the_multiplier_is_that_of_a_slow_loop(task, seed):
+    task, rng = TASKS[task], np.random.default_rng(seed)
+    recipe = Recipe(episodes=1, steps=10_000, limit_falls=(0.3, 0.8), prices=(0.1, 0.8))
+    schedule = Schedule(task, recipe, "lagrangian", episodes := [], first_step=2_000)
+    integral = price = 0.0
+    prices, integrals = [], []
+    for step in range(0, 9_000, 250):  # 1,000 steps more than the run has
+        costs = [int(cost) for cost in rng.integers(0, task.cost_range + 1, rng.integers(0, 4))]
+        share = (2_000 + step) / 10_000
+        if share <= 0.3:
+            limit = task.cost_range
+        elif share >= 0.8:
+            limit = 0
+        else:
+            limit = task.cost_range * (0.8 - share) / 0.5
+        if costs:
+            violation = (sum(costs) / len(costs) - limit) / task.cost_range
+            integral += violation / 5
+            integral = 0.0 if integral < 0 else 0.8 if integral > 0.8 else integral
+            price = integral + violation + violation
+            price = 0.0 if price < 0 else price
+        episodes += [episode_of(cost, task.horizon) for cost in costs]
+        assert at(schedule, step) == pytest.approx(price)
+        assert schedule.multiplier.integral == pytest.approx(integral)
+        prices.append(price), integrals.append(integral)
+    assert min(prices) == min(integrals) == 0 and max(integrals) == 0.8  # all that is cut off was cut off
+
+
+def noted(monkeypatch):
+    """Notes of every model that `run_ppo` makes: (scales, learning rates, state before and after a slice)."""
+    scales, rates, states, make = [], [], [], ppo.make_ppo
+
+    def state(model, schedule):
+        weights = {key: value.numpy().copy() for key, value in model.policy.state_dict().items()}
+        rms = {"mean": model.env.obs_rms.mean.copy(), "var": np.array(model.env.ret_rms.var)}
+        return weights | rms | {"multiplier": np.array(schedule.multiplier.value)}
+
+    def noting(*arguments):
+        model, schedule = make(*arguments)
+        train, learn = model.train, model.learn
+
+        def train_and_note():
+            train()
+            scales.append(model.env.get_attr("price_scale")[0])
+            rates.append(model.policy.optimizer.param_groups[0]["lr"])
+
+        def learn_and_note(steps, callback):
+            states.append(state(model, schedule))
+            learn(steps, callback)
+            states.append(state(model, schedule))
+
+        model.train, model.learn = train_and_note, learn_and_note
+        return model, schedule
+
+    monkeypatch.setattr(ppo, "make_ppo", noting)
+    return scales, rates, states
+
+
+def assert_continued(states):
+    """Every slice begins with the weights, the normalisation and the multiplier that the one before it left."""
+    assert len(states) > 2
+    for end, start in zip(states[1:-1:2], states[2::2], strict=True):
+        for key, value in end.items():
+            np.testing.assert_array_equal(value, start[key], err_msg=key)
+    assert any((states[0][key] != states[1][key]).any() for key in states[0])
+
+
+def test_prices_rise_and_the_learning_rate_falls_along_a_run(tmp_path, monkeypatch):
+    scales, rates, states = noted(monkeypatch)
+    recipe = replace(RECIPE, ramp=(0.25, 0.75), learning_rate=(1e-3, 2e-4), steps=4 * BATCH)
+    run_ppo(BALL, recipe, "priced", 0, tmp_path, slice_steps=BATCH)
+    assert scales == pytest.approx([0, 0, 0.5, 1]) and rates == pytest.approx([1e-3, 8e-4, 6e-4, 4e-4])
+    assert_continued(states)
+
+
+def test_without_a_ramp_prices_are_full_from_the_first_step():
+    assert at(Schedule(BALL, replace(RECIPE, ramp=None), "priced", []), 0) == 1
+
+
+def test_the_multiplier_goes_on_from_slice_to_slice(tmp_path, monkeypatch):
+    scales, _, states = noted(monkeypatch)
+    run_ppo(BALL, RECIPE, "lagrangian", 0, tmp_path, slice_steps=SLICE)
+    assert scales[0] == 0 < scales[1] == scales[2] != scales[3]  # two batches in a slice
+    episodes = load_file(tmp_path / "episodes-000.safetensors")
+    costs = episodes["costs"].reshape(-1, 100).sum(axis=1)[:16]  # those that the first batch ended
+    assert scales[1] == pytest.approx(2.2 * costs.mean() / 80)  # the limit is zero by then
+    assert_continued(states)
 
 
 # --- Killed and resumed ---
 
 
-def run_and_die(when, folder):
-    """What the killed process does: the first slice, and less than the second."""
-    save, steps = collecting._save, []
+@pytest.fixture(scope="module")
+def uninterrupted(tmp_path_factory):
+    """The folder of a run of each kind that nothing interrupted."""
+    folder = tmp_path_factory.mktemp("uninterrupted")
+    for kind in KINDS:
+        run_ppo(BALL, RECIPE, kind, 0, folder / "BallRun" / f"{kind}-0", slice_steps=SLICE)
+    return folder
+
+
+def run_and_die(when, kind, folder):
+    """What the killed process does: the first slice, and a part of the second."""
+    save, step, steps = ppo.save_arrays, RecordedTask.step, []
 
     def killed_before_the_episodes(arrays, path, *rest):
         if path.name == "episodes-001.safetensors":
             os.kill(os.getpid(), signal.SIGKILL)
         save(arrays, path, *rest)
 
-    def killed_in_the_middle(self, action, step=PricedCost.step):
+    def killed_in_the_middle(self, action):
         steps.append(1)
         if len(steps) == SLICE + SLICE // 2:
             os.kill(os.getpid(), signal.SIGKILL)
         return step(self, action)
 
     if when == "between the two files":
-        collecting._save = killed_before_the_episodes
+        ppo.save_arrays = killed_before_the_episodes
     else:
-        PricedCost.step = killed_in_the_middle
-    run_ppo(BALL, RECIPE, 0, folder / "BallRun" / "seed-0", slice_steps=SLICE)
+        RecordedTask.step = killed_in_the_middle
+    run_ppo(BALL, RECIPE, kind, 0, folder, slice_steps=SLICE)
 
 
+@pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("when", ["between the two files", "in the middle"])
-def test_a_killed_collection_goes_on_and_makes_a_dataset(when, tmp_path, monkeypatch):
-    command, env = [sys.executable, __file__, when, tmp_path], os.environ | {"PYTHONPATH": str(ROOT)}
+def test_a_killed_run_continues_to_the_bytes_of_one_that_was_not(when, kind, uninterrupted, tmp_path):
+    command, env = [sys.executable, __file__, when, kind, tmp_path], os.environ | {"PYTHONPATH": str(ROOT)}
     child = subprocess.run(command, env=env, capture_output=True, text=True)
     assert child.returncode == -signal.SIGKILL, child.stderr
-    run, out = tmp_path / "BallRun" / "seed-0", tmp_path / "data.hdf5"
-    assert [path.name for path in sorted(run.glob("episodes-*"))] == ["episodes-000.safetensors"]
-    first = (run / "episodes-000.safetensors").read_bytes()
+    there = {"episodes-000.safetensors", "state-001.safetensors"}
+    if when == "between the two files":
+        there.add("state-002.safetensors")
+    assert {path.name for path in tmp_path.iterdir()} == there
 
+    run_ppo(BALL, RECIPE, kind, 0, tmp_path, slice_steps=SLICE)
+    expected = uninterrupted / "BallRun" / f"{kind}-0"
+    names = ["episodes-000.safetensors", "episodes-001.safetensors", "state-002.safetensors"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == names  # nothing half-written, and no pickle
+    assert sorted(path.name for path in expected.iterdir()) == names
+    for name in names[:2]:
+        assert (tmp_path / name).read_bytes() == (expected / name).read_bytes()
+    ours, theirs = (load_file(folder / names[2]) for folder in (tmp_path, expected))
+    assert ours.keys() == theirs.keys()
+    for key in ours.keys() - {"seconds"}:
+        np.testing.assert_array_equal(ours[key], theirs[key], err_msg=key)
+    assert (ours["multiplier.value"] > 0) == (kind == "lagrangian")
+
+
+def test_the_slices_and_the_kinds_play_other_episodes(uninterrupted):
+    slices = [load_file(path) for path in sorted(uninterrupted.glob("BallRun/*/episodes-*"))]
+    assert [len(arrays["rewards"]) for arrays in slices] == [3_200] * 4
+    starts = np.concatenate([arrays["observations"][::100] for arrays in slices])
+    assert len(np.unique(starts, axis=0)) == 128
+
+
+def test_a_state_names_its_recipe_without_what_only_thinning_reads(uninterrupted):
+    with safe_open(uninterrupted / "BallRun" / "priced-0" / "state-002.safetensors", "np") as file:
+        metadata = file.metadata()
+    played = {
+        "steps": 8192,
+        "prices": [0.02, 4.0],
+        "allowance_share": 0.5,
+        "allowances": [0.0, 1.0],
+        "ramp": [0.15, 0.5],
+        "learning_rate": [0.001, 0.0003],
+        "calm": None,
+        "target_kl": None,
+        "batch_steps": 2048,
+        "width": 64,
+        "limit_falls": [0.0, 0.01],
+        "own_axes": False,
+    }
+    assert metadata == {"recipe": json.dumps(played), "slice_steps": "4096"}
+
+
+@pytest.mark.parametrize("kind", ["", "Priced", "priced-0"])
+def test_a_run_of_an_unknown_kind_is_refused(kind, tmp_path):
+    with pytest.raises(ValueError, match=f"^unknown kind of source '{kind}': .* priced, lagrangian$"):
+        run_ppo(BALL, RECIPE, kind, 0, tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+# --- From runs to a dataset ---
+
+
+def test_collected_episodes_become_a_dataset(uninterrupted, tmp_path, monkeypatch):
     monkeypatch.setattr(collecting, "run_ppo", functools.partial(run_ppo, slice_steps=SLICE))
-    made = collecting.collect(BALL, (0,), RECIPE, tmp_path, out, workers=1)
-    assert (run / "episodes-000.safetensors").read_bytes() == first
-    assert {p.suffix for p in run.iterdir()} == {".safetensors"}  # nothing half-written, and no pickle
-    slices = [load_file(path)["observations"] for path in sorted(run.glob("episodes-*"))]
-    assert [len(rows) for rows in slices] == [1_600, 1_600]
-    starts = np.concatenate([rows[::100] for rows in slices])
-    assert len(np.unique(starts, axis=0)) == 32  # the second slice is no repetition of the first
-
+    monkeypatch.setattr(ppo, "make_ppo", None)  # all episodes are there: nothing is run again
+    out = tmp_path / "data.hdf5"
+    made = collecting.collect(BALL, SOURCES, RECIPE, uninterrupted, out, workers=1)
     data = read_dataset(out, BALL)
+    assert made.checksum == data.checksum and made.attributes == data.attributes
     attributes = data.attributes
-    assert (attributes["task"], attributes["seeds"]) == ("BallRun", "[0]")
-    assert attributes["collected_episodes"] == 32
-    assert attributes["recipe"] == str(vars(RECIPE)) and attributes["made_by"] == "c2iql collect BallRun"
-    assert attributes["wall_seconds"] >= 0 and "CC BY" in attributes["licence"]
+    assert attributes["task"] == "BallRun" and attributes["made_by"] == "c2iql collect BallRun"
+    assert attributes["collected_episodes"] == 128 and attributes["recipe"] == str(asdict(RECIPE))
+    states = [load_file(uninterrupted / "BallRun" / s / "state-002.safetensors") for s in SOURCES]
+    assert attributes["wall_seconds"] == round(sum(float(state["seconds"]) for state in states)) > 0
+    assert "CC BY" in attributes["licence"] and "seeds" not in attributes
     for package in ("stable-baselines3", "pybullet", "bullet-safety-gym", "torch"):
         assert f"{package} " in attributes["versions"]
 
-    assert 20 <= data.num_episodes == made.num_episodes <= 32
+    assert 20 <= data.num_episodes <= 40
     assert (data.episode_lengths == 100).all() and data.timeouts.sum() == data.num_episodes
     assert np.isin(data.costs, (0, 1)).all() and np.abs(data.actions).max() <= 1
     follows = np.flatnonzero(~data.timeouts)
     np.testing.assert_array_equal(data.next_observations[follows], data.observations[follows + 1])
     assert data.rewards.std() > 0.1 and len(np.unique(data.episode_returns)) == data.num_episodes
 
-    monkeypatch.setattr(collecting, "_make_ppo", None)  # all is there: nothing is run again
-    collecting.collect(BALL, (0,), RECIPE, tmp_path, tmp_path / "again.hdf5", workers=1)
+    # Each episode is one of its source's, counted in the files.
+    starts_of = {
+        source: np.concatenate([load_file(p)["observations"][::100] for p in sorted(run.glob("episodes-*"))])
+        for source, run in ((source, uninterrupted / "BallRun" / source) for source in SOURCES)
+    }
+    found = [
+        (source, int(np.flatnonzero((starts == row).all(axis=1))[0]))
+        for row in data.observations[data.starts]
+        for source, starts in starts_of.items()
+        if (starts == row).all(axis=1).any()
+    ]
+    assert len(found) == data.num_episodes
+    assert found == sorted(found, key=lambda f: (SOURCES.index(f[0]), f[1]))
+    counts = Counter(source for source, _ in found)
+    assert json.loads(attributes["episodes_by_source"]) == counts and len(counts) == 2
+
+    collecting.collect(BALL, SOURCES, RECIPE, uninterrupted, tmp_path / "again.hdf5", workers=1)
     assert (tmp_path / "again.hdf5").read_bytes() == out.read_bytes()
-    with pytest.raises(ValueError, match=f"{run}: was begun with another recipe"):
-        collecting.collect(BALL, (0,), replace(RECIPE, prices=(5.0, 50.0)), tmp_path, out, workers=1)
+    run = uninterrupted / "BallRun" / "priced-0"
+    for change in ({"prices": (5.0, 50.0)}, {"limit_falls": (0.0, 0.5)}, {"width": 65}):
+        with pytest.raises(ValueError, match=f"^{run}: was begun with another recipe"):
+            collecting.collect(BALL, SOURCES, replace(RECIPE, **change), uninterrupted, out, workers=1)
+    fewer = replace(RECIPE, episodes=5, return_bins=1)  # only thinned in another way
+    assert collecting.collect(BALL, SOURCES, fewer, uninterrupted, out, workers=1).num_episodes < 20
 
 
-def test_prices_rise_and_the_learning_rate_falls_along_a_run(tmp_path, monkeypatch):
-    scales, rates, make = [], [], collecting._make_ppo
+def write_run(folder, slices, first_tag):
+    """A finished run by hand: in each slice, episodes of these (cost, terminal); tags count its episodes."""
+    folder.mkdir(parents=True)
+    tag, total = first_tag, 0
+    for index, episodes in enumerate(slices):
+        rows = {key: [] for key in KEYS}
+        for cost, terminal in episodes:
+            steps = max(3, cost)
+            for step in range(steps):
+                last = step == steps - 1
+                rows["observations"].append([tag] * 7), rows["next_observations"].append([tag + 0.5] * 7)
+                rows["actions"].append([0.1, -0.1]), rows["rewards"].append(tag / 10)
+                rows["costs"].append(float(step < cost))
+                rows["terminals"].append(last and terminal), rows["timeouts"].append(last and not terminal)
+            tag, total = tag + 1, total + 1
+        arrays = {key: np.array(values) for key, values in rows.items()}
+        save_file(arrays, folder / f"episodes-{index:03d}.safetensors")
+    save_file({"seconds": np.array(10.0)}, folder / f"state-{len(slices):03d}.safetensors")
 
-    def noting(*arguments):
-        model = make(*arguments)
-        train = model.train
 
-        def noted():
-            train()
-            scales.append(model.env.get_attr("price_scale")[0])
-            rates.append(model.policy.optimizer.param_groups[0]["lr"])
+@pytest.mark.parametrize(
+    "sources", [("priced-0", "lagrangian-7", "priced-2"), ("priced-2", "lagrangian-7", "priced-0")]
+)
+def test_the_episodes_of_a_source_stand_together_in_the_order_of_sources(sources, tmp_path, monkeypatch):
+    """Every episode carries a tag: hundreds for the source, and its place in the run."""
+    runs = tmp_path / "BallRun"
+    write_run(
+        runs / "priced-0", [[(0, True), (5, False), (90, False)], [(7, False), (81, True), (3, True)]], 100
+    )
+    write_run(runs / "lagrangian-7", [[(85, False), (99, False)]], 200)  # all cost more than 80
+    write_run(runs / "priced-2", [[(2, False)], [(90, True)], [(1, True), (4, False)]], 300)
+    asked = []
+    monkeypatch.setattr(collecting, "run_ppo", lambda *arguments: asked.append(arguments))
+    made = collecting.collect(BALL, sources, RECIPE, tmp_path, tmp_path / "out.hdf5", workers=1)
 
-        model.train = noted
-        return model
+    tags = {"priced-0": [100, 101, 103, 105], "lagrangian-7": [], "priced-2": [300, 302, 303]}
+    assert made.observations[made.starts, 0].tolist() == [tag for source in sources for tag in tags[source]]
+    assert made.observations[made.ends - 1, 0].tolist() == made.observations[made.starts, 0].tolist()
+    assert json.loads(made.attributes["episodes_by_source"]) == {s: len(tags[s]) for s in sources}
+    assert list(json.loads(made.attributes["episodes_by_source"])) == list(sources)
+    assert (made.attributes["collected_episodes"], made.attributes["wall_seconds"]) == (12, 30)
+    costs = {100: 0, 101: 5, 103: 7, 105: 3, 300: 2, 302: 1, 303: 4}
+    assert made.episode_costs.tolist() == [costs[tag] for source in sources for tag in tags[source]]
+    assert [(kind, seed, run) for _, _, kind, seed, run in asked] == [
+        (*source.split("-")[:1], int(source.split("-")[1]), runs / source) for source in sources
+    ]
 
-    monkeypatch.setattr(collecting, "_make_ppo", noting)
-    recipe = replace(RECIPE, ramp=(0.25, 0.75), learning_rate=(1e-3, 2e-4), steps=4 * SLICE)
-    run_ppo(BALL, recipe, 0, tmp_path, slice_steps=SLICE)
-    assert scales == pytest.approx([0, 0, 0.5, 1]) and rates == pytest.approx([1e-3, 8e-4, 6e-4, 4e-4])
+
+@pytest.mark.parametrize(
+    "sources, message",
+    [
+        ((), r"^sources \[\]: give at least one, and each of them once$"),
+        (("priced-0", "priced-0"), r"^sources \['priced-0', 'priced-0'\]: .* each of them once$"),
+        (("priced",), "^source 'priced': write KIND-SEED, e.g. priced-0; the kinds are priced, lagrangian$"),
+        (("x-0",), "^source 'x-0': write KIND-SEED"),
+        (("priced-x",), "^source 'priced-x': write KIND-SEED"),
+        (("priced-",), "^source 'priced-': write KIND-SEED"),
+        (("priced--1",), "^source 'priced--1': write KIND-SEED"),
+        (("priced-0", "priced-00"), "^source 'priced-00': write KIND-SEED"),  # the same run again
+        (("priced-0", "lagrangian_0"), "^source 'lagrangian_0': write KIND-SEED"),
+    ],
+)
+def test_other_sources_are_refused_in_one_line_before_anything_is_run(
+    sources, message, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(collecting, "run_ppo", lambda *arguments: pytest.fail("it was run"))
+    with pytest.raises(ValueError, match=message) as caught:
+        collecting.collect(BALL, sources, RECIPE, tmp_path, tmp_path / "out.hdf5", workers=1)
+    assert "\n" not in str(caught.value) and not list(tmp_path.iterdir())
 
 
-def test_ppo_is_saved_and_loaded_whole(tmp_path):
-    def make(seed):
-        return collecting._make_ppo(BALL, RECIPE, seed, [], {"progress": 0.0})
+def test_a_source_is_a_kind_and_a_seed():
+    assert read_source("priced-0") == ("priced", 0) and read_source("lagrangian-12") == ("lagrangian", 12)
+    assert [read_source(source)[0] for source in SOURCES] == list(KINDS)
 
-    model, other = make(0), make(7)
-    model.learn(SLICE)
-    collecting._save_ppo(model, tmp_path / "state.safetensors", 12.5, {})
-    collecting._load_ppo(other, tmp_path / "state.safetensors")
-    observations = np.random.default_rng(0).normal(size=(5, 9)).astype(np.float32)
+
+# --- PPO ---
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_ppo_and_its_schedule_are_saved_and_loaded_whole(kind, tmp_path):
+    (model, schedule), (other, loaded) = (make_ppo(BALL, RECIPE, kind, seed, []) for seed in (0, 7))
+    model.learn(BATCH, callback=schedule)
+    schedule.multiplier.integral, schedule.multiplier.value = 0.1 + 0.2, 1 / 3
+    save_ppo(model, schedule, tmp_path / "state.safetensors", 12.5, {"recipe": "this"})
+    assert load_ppo(other, loaded, tmp_path / "state.safetensors") == 12.5
+    with safe_open(tmp_path / "state.safetensors", "np") as file:
+        assert file.metadata() == {"recipe": "this"}
+    width = 9 if kind == "priced" else 7
+    observations = np.random.default_rng(0).normal(size=(5, width)).astype(np.float32)
     chosen = [m.predict(observations, deterministic=True)[0] for m in (model, other)]
     np.testing.assert_array_equal(*chosen)
     ours, theirs = (m.policy.optimizer.state_dict()["state"] for m in (model, other))
@@ -337,33 +629,35 @@ def test_ppo_is_saved_and_loaded_whole(tmp_path):
             assert value.shape == theirs[index][name].shape
     np.testing.assert_array_equal(*(m.env.normalize_obs(observations) for m in (model, other)))
     np.testing.assert_array_equal(*(m.env.normalize_reward(np.ones(3)) for m in (model, other)))
-    assert other.num_timesteps == model.num_timesteps == SLICE
-    other.learn(SLICE, reset_num_timesteps=False)  # it can go on
-    collecting._save_ppo(other, tmp_path / "state.safetensors", 2.5, {})
-    again = load_file(tmp_path / "state.safetensors")
-    assert (again["seconds"], again["steps"]) == (15.0, 2 * SLICE)
+    assert (loaded.multiplier.integral, loaded.multiplier.value) == (0.1 + 0.2, 1 / 3)  # exactly
+    scales = []
+    train = other.train
+    other.train = lambda: (scales.append(other.env.get_attr("price_scale")[0]), train())
+    other.learn(BATCH, callback=loaded)  # it can go on, at the loaded multiplier
+    assert scales == [1 / 3 if kind == "lagrangian" else 0]
 
 
 def test_target_kl_stops_the_epochs_early():
     """PPO goes over a batch ten times, here in four parts; a policy that may not move is stopped at once."""
 
     def steps(target_kl):
-        model = collecting._make_ppo(BALL, replace(RECIPE, target_kl=target_kl), 0, [], {"progress": 0.0})
-        model.learn(SLICE)
+        model, schedule = make_ppo(BALL, replace(RECIPE, target_kl=target_kl), "priced", 0, [])
+        model.learn(BATCH, callback=schedule)
         return {int(moments["step"]) for moments in model.policy.optimizer.state_dict()["state"].values()}
 
-    assert steps(None) == {10 * SLICE // 512}
+    assert steps(None) == {10 * BATCH // 512}
     (stopped,) = steps(1e-9)
     assert stopped <= 2
 
 
 def test_a_calm_run_ends_with_little_noise(tmp_path):
     """Two slices, calm from the second on; an untrained policy's mean actions are near zero."""
-    run_ppo(BALL, replace(RECIPE, calm=(0.5, 0.1)), 0, tmp_path, slice_steps=SLICE)
+    recipe = replace(RECIPE, calm=(0.5, 0.1), steps=2 * BATCH)
+    run_ppo(BALL, recipe, "priced", 0, tmp_path, slice_steps=BATCH)
     slices = [load_file(path)["actions"] for path in sorted(tmp_path.glob("episodes-*"))]
     early, late = (actions.std() for actions in slices)
     assert early == pytest.approx(math.exp(-0.5), abs=0.1) and 0.09 < late < 0.45
-    log_std = load_file(tmp_path / "state.safetensors")["policy.log_std"]
+    log_std = load_file(tmp_path / "state-002.safetensors")["policy.log_std"]
     assert (log_std < math.log(0.1) + 0.05).all()
 
 
@@ -371,5 +665,16 @@ def test_every_task_has_a_recipe():
     assert RECIPES.keys() == TASKS.keys()
 
 
+def test_the_data_and_the_command_line_start_without_stable_baselines3():
+    """It takes seconds to import."""
+    code = (
+        "import sys, tutorial_lib.data, tutorial_lib.__main__, tutorial_lib.tasks.recipes\n"
+        "print([name for name in sys.modules if name.startswith('stable_baselines3')])"
+    )
+    env = os.environ | {"PYTHONPATH": str(ROOT)}
+    child = subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True)
+    assert child.stdout == "[]\n", child.stderr
+
+
 if __name__ == "__main__":
-    run_and_die(sys.argv[1], Path(sys.argv[2]))
+    run_and_die(*sys.argv[1:3], Path(sys.argv[3]))

@@ -1,35 +1,33 @@
 """The command line: `c2iql tasks | collect | fetch | train | evaluate | study | report`.
 
 tyro turns functions and dataclasses into commands with help and types, so no option is written twice.
+Everything
+else is imported inside the commands: `c2iql --help` answers at once.
 """
 
-import contextlib
 import dataclasses
-import inspect
-import io
 import sys
+from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-import pandas as pd
-import torch
 import tyro
-
-from tutorial_lib import checkpoints, playing, scores, training
-from tutorial_lib.agents import get_algorithm
-from tutorial_lib.config import Config, get_profile
-from tutorial_lib.data.sources import fetch_dataset, load_dataset
-from tutorial_lib.studies import grids
-from tutorial_lib.tasks import TASKS, get_task
 
 Positional = tyro.conf.Positional
 Device = Literal["cpu", "cuda"]
 
 
 def tasks() -> None:
-    """List the tasks: horizon, dimensions, thresholds, reference returns."""
-    table = pd.DataFrame([dataclasses.asdict(task) for task in TASKS.values()])
-    print(table.drop(columns=["env_id", "dsrl_file"]).to_string(index=False))
+    """List the tasks: horizon, dimensions, limits, reference returns."""
+    import pandas as pd
+
+    from tutorial_lib.tasks import TASKS
+
+    columns = (
+        "name family horizon obs_dim act_dim gammas thresholds cost_range min_return max_return terminates"
+    )
+    rows = [{name: getattr(task, name) for name in columns.split()} for task in TASKS.values()]
+    print(pd.DataFrame(rows).to_string(index=False))
 
 
 def fetch(task: Positional[str], directory: Path | None = None) -> None:
@@ -39,6 +37,8 @@ def fetch(task: Positional[str], directory: Path | None = None) -> None:
         task: which task, e.g. CarCircle.
         directory: where to; default DSRL_DATASET_DIR or ~/.dsrl/datasets.
     """
+    from tutorial_lib.data.sources import fetch_dataset
+
     fetch_dataset(task, directory)
 
 
@@ -53,7 +53,7 @@ def collect(
 ) -> None:
     """Make a dataset from the simulator with PPO agents of two kinds, thinned on a cost-return grid.
 
-    A killed run continues where it was.
+    A killed collection continues where it was.
 
     Args:
         task: which task, e.g. BallCircle.
@@ -64,7 +64,8 @@ def collect(
         runs: folder for what is kept between a kill and a resume.
         workers: PPO runs side by side.
     """
-    from tutorial_lib.data import collect as collecting  # pulls in stable-baselines3: slow to import
+    from tutorial_lib.data import collect as collecting
+    from tutorial_lib.tasks import get_task
 
     check_counts(steps=steps, episodes=episodes, workers=workers)
     recipe = collecting.RECIPES[get_task(task).name]
@@ -77,43 +78,33 @@ def collect(
     print(f"{out}: {dataset.num_episodes} episodes, {len(dataset)} transitions")
 
 
-def train(
-    task: Positional[str],
-    algorithm: str = "C2IQL",
-    profile: str = "small",
-    seeds: tuple[int, ...] = (0,),
-    threshold: float | None = None,
-    data: str = "shipped",
-    out: Path | None = None,
-    device: Device = "cpu",
-    option: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE")] = (),
-) -> None:
-    """Train an agent (several seeds together) and save it with its log; resumes a killed run.
+def train(words: tuple[str, ...] = ()) -> None:
+    """Train an agent and save it with its log: `c2iql train [ALGORITHM] TASK [options]`.
 
-    Args:
-        task: which task, e.g. BallCircle.
-        algorithm: a name from the list that a wrong one prints.
-        profile: paper, or small, which trains in minutes on a laptop.
-        seeds: one run each, trained together.
-        threshold: the cost limit, for algorithms that are trained for one.
-        data: shipped, dsrl, or a file.
-        out: folder of the run; default runs/TASK/ALGORITHM-PROFILE.
-        device: cpu or cuda.
-        option: changes to the profile, e.g. kappa_2=0.7 time_limits=mask.
+    Several seeds train together. A killed run continues where it was. Without options it makes the agent of
+    the results' table. `c2iql train ALGORITHM --help` shows all options of an algorithm; without ALGORITHM it
+    is C2IQL.
     """
-    record, kind = get_task(task), get_algorithm(algorithm)
-    config = with_options(get_profile(profile), option)
-    suffix = "" if threshold is None else f"-{threshold:g}"
-    out = (
-        out
-        or Path("runs") / record.name / f"{algorithm.replace(' ', '-').replace('/', '')}{suffix}-{profile}"
-    )
-    agent = kind(record, config, seeds=seeds, threshold=threshold, device=check_device(device))
-    own = grids.OWN_OPTIONS.get(record.name, {}) if (algorithm, profile) == ("C2IQL", "small") else {}
-    if any(getattr(config, name) != value for name, value in own.items()):
-        words = " ".join(f"{name}={value}" for name, value in own.items())
-        print(f"The agents of {record.name} in the results have options of their own: --option {words}")
-    training.train(agent, load_dataset(record, data), run_dir=out)
+    from tutorial_lib import checkpoints, training
+    from tutorial_lib.agents import slug
+    from tutorial_lib.data import load_dataset
+    from tutorial_lib.options import parse_training
+    from tutorial_lib.tasks import get_task
+
+    kind, args = parse_training(list(words))
+    task = get_task(args.task)
+    limits = args.limits or task.thresholds
+    if args.limits and not kind.needs_limit:
+        raise ValueError(f"--limits: {kind.name} is trained for no limit; it is told one when it plays")
+    if not args.seeds:
+        raise ValueError("--seeds: give at least one")
+    pairs = [(seed, limit) for limit in (limits if kind.needs_limit else (None,)) for seed in args.seeds]
+    device = check_device(args.device)
+    seeds, of_runs = zip(*pairs, strict=True)
+    agent = kind(task, args.config, seeds, of_runs if kind.needs_limit else None, device)
+    suffix = "".join(f"-{limit:g}" for limit in args.limits)
+    out = args.out or Path("runs") / task.name / f"{slug(kind.name)}{suffix}-{args.config.profile}"
+    training.train(agent, load_dataset(task, args.data), run_dir=out)
     checkpoints.save_agent(agent, out / "agent.safetensors")
     log = out / checkpoints.METRICS
     print(f"{out}/agent.safetensors: trained for {agent.updates} updates; its log is {log}")
@@ -122,7 +113,7 @@ def train(
 def evaluate(
     agent: Positional[Path],
     out: Path | None = None,
-    thresholds: tuple[float, ...] | None = None,
+    limits: tuple[float, ...] | None = None,
     episodes: int = 10,
     workers: int = 2,
 ) -> None:
@@ -131,15 +122,17 @@ def evaluate(
     Args:
         agent: an agent.safetensors or a checkpoint.safetensors.
         out: the CSV to write; default beside the agent, e.g. agent-results.csv.
-        thresholds: cost limits; default the task's three, or the one that the agent was trained for.
-        episodes: per seed and threshold.
+        limits: on the cost of an episode; default the task's own, or those that the agent was trained for.
+        episodes: per run and limit.
         workers: processes; the results do not depend on their number.
     """
+    from tutorial_lib import checkpoints, playing, scores
+
     check_counts(episodes=episodes, workers=workers)
     out = out or agent.with_name(f"{agent.stem}-results.csv")
     if out.is_dir():
         raise ValueError(f"--out {out}: is a folder: name a file")
-    results = playing.evaluate(checkpoints.load_agent(agent), thresholds, episodes, workers)
+    results = playing.evaluate(checkpoints.load_agent(agent), limits, episodes, workers)
     print(scores.summarise(results).round(3).to_string(index=False))
     print("(low, high: 95% bootstrap intervals over episodes, all seeds pooled)")
     scores.save_results(results, out)
@@ -151,7 +144,6 @@ def study(
     only: str = "*",
     scheduler: str | None = None,
     workers: int | None = None,
-    steps: int | None = None,
     profile: str = "small",
     option: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE")] = (),
     data: str = "shipped",
@@ -161,45 +153,46 @@ def study(
 ) -> None:
     """Run a study, a grid of training runs and their episodes, and gather its results in one CSV.
 
-    Cells that are finished are skipped, and those that were killed go on from their last checkpoint. Equal
-    agents that are shipped, or that another study trained, are not trained again.
+    Entries that are finished are skipped, and those that were killed continue from their last checkpoint.
+    Equal agents that are shipped, or that another study trained, are not trained again.
 
     Args:
         name: which study, e.g. ablations; a wrong one prints the list.
-        only: run only the cells whose name has this in it, a pattern such as CarCircle*CIQL.
+        only: run only the entries whose name has this in it, a pattern such as CarCircle*CIQL.
         scheduler: address of a dask scheduler; default one process for each core of this machine.
         workers: processes on this machine.
-        steps: updates of every run, for a trial.
         profile: of every run.
-        option: changes to every run, e.g. steps=200 crm_steps=100.
+        option: changes to every run, for a trial, e.g. updates=200 crm_steps=100.
         data: shipped, or dsrl.
         runs: folder of all studies' runs.
         out: the CSV to write; default data/results/NAME.csv, and in a trial runs/studies/NAME.csv.
-        dry: only list the cells, and which of them are finished.
+        dry: only list the entries, and which of them are finished.
     """
-    from tutorial_lib.studies import cluster, results, runs  # pulls in dask
+    from tutorial_lib.options import with_options
+    from tutorial_lib.studies import cluster, grids, results
+    from tutorial_lib.studies import runs as of_study
 
-    check_counts(workers=workers, steps=steps)
+    check_counts(workers=workers)
     record, folder = grids.get_study(name), runs / name
-    changes = (*option, *(() if steps is None else (f"steps={steps}",)))
-    settings = {"change": lambda config: with_options(config, changes), "profile": profile, "data": data}
-    grid, chosen = grids.cells(record, **settings), grids.cells(record, only, **settings)
-    trial = bool(changes) or profile != "small" or data != "shipped"
+    settings: dict[str, Any] = {"change": lambda config: with_options(config, option)}
+    settings |= {"profile": profile, "data": data}
+    grid, chosen = grids.entries(record, **settings), grids.entries(record, only, **settings)
+    trial = bool(option) or profile != "small" or data != "shipped"
     out = out or (runs / f"{name}.csv" if trial else results.RESULTS / f"{name}.csv")
     print(record.question)
     if dry:
-        for cell in chosen:
-            print("done   " if runs.results_path(cell, folder).exists() else "waiting", cell.name)
+        for entry in chosen:
+            print("done   " if of_study.results_path(entry, folder).exists() else "waiting", entry.name)
         return
     with cluster.connect(scheduler, workers) as client:
-        failures = cluster.run_cells(chosen, folder, client)
-    done = runs.collect(grid, folder, out, keep=not trial)
-    print(f"{out}: {done} of {len(grid)} cells are finished here")
-    for cell, reason in failures.items():
-        print(f"FAILED {cell}: {reason}")
+        failures = cluster.run_all(chosen, folder, client)
+    done = of_study.collect(grid, folder, out, keep=not trial)
+    print(f"{out}: {done} of {len(grid)} entries are finished here")
+    for entry, reason in failures.items():
+        print(f"FAILED {entry}: {reason}")
     if failures:
         raise ValueError(
-            f"{len(failures)} of {len(chosen)} cells failed; run the study again to try them again"
+            f"{len(failures)} of {len(chosen)} entries failed; run the study again to try them again"
         )
 
 
@@ -220,24 +213,6 @@ def report(name: Positional[str | None] = None) -> None:
     print(f"wrote {path}" if path else "no figure")
 
 
-def with_options(config: Config, options: tuple[str, ...]) -> Config:
-    """The config with `name=value` changes; values are read as the field's own type. Raises ValueError."""
-    types = {field.name: field.type for field in dataclasses.fields(Config) if field.name != "profile"}
-    changes = {}
-    for option in options:
-        name, equals, text = option.partition("=")
-        if not equals or name not in types:
-            raise ValueError(f"--option {option}: write NAME=VALUE with one of {', '.join(types)}")
-        try:
-            with contextlib.redirect_stderr(io.StringIO()):  # tyro's message is for another command line
-                value = tyro.cli(types[name], args=[text])
-        except SystemExit:
-            kind = "True or False" if types[name] is bool else inspect.formatannotation(types[name])
-            raise ValueError(f"--option {option}: the value must be {kind}") from None
-        changes[name] = value
-    return dataclasses.replace(config, **changes)  # at once: what fits together may come in any order
-
-
 def check_counts(**numbers: int | None) -> None:
     """ValueError for an argument that must be at least one and is not."""
     for name, number in numbers.items():
@@ -247,6 +222,8 @@ def check_counts(**numbers: int | None) -> None:
 
 def check_device(device: Device) -> Device:
     """The device itself, or ValueError where this machine has none."""
+    import torch
+
     if device == "cuda" and not torch.cuda.is_available():
         raise ValueError("--device cuda: PyTorch finds no CUDA device here: leave it out to train on the CPU")
     return device
@@ -254,12 +231,19 @@ def check_device(device: Device) -> Device:
 
 def main() -> None:
     """Entry point: errors that a user can mend are one line, without a traceback."""
+    words = sys.argv[1:]
+    if words == ["--version"]:
+        print(f"c2iql {version('c2iql-tutorial')}")
+        return
     commands = {f.__name__: f for f in (tasks, collect, fetch, train, evaluate, study, report)}
     try:
-        tyro.extras.subcommand_cli_from_dict(
-            commands, prog="c2iql", description="Safe offline RL with C2IQL."
-        )
-    except (ValueError, OSError, checkpoints.TrainingError) as error:
+        if words[:1] == ["train"] and words[1:] not in ([], ["--help"], ["-h"]):
+            train(tuple(words[1:]))
+        else:
+            tyro.extras.subcommand_cli_from_dict(
+                commands, prog="c2iql", description="Safe offline reinforcement learning with C2IQL."
+            )
+    except (ValueError, OSError) as error:
         sys.exit(f"c2iql: {error}")
 
 

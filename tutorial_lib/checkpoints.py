@@ -10,7 +10,6 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
 from tutorial_lib.agents import Agent, get_algorithm
-from tutorial_lib.config import Config
 from tutorial_lib.files import written_whole
 from tutorial_lib.tasks import get_task
 
@@ -20,7 +19,7 @@ CHECKPOINT = "checkpoint.safetensors"
 METRICS = "metrics.csv"
 
 
-class TrainingError(RuntimeError):
+class TrainingError(ValueError):
     """Training cannot go on: what happened, when, and what to try."""
 
 
@@ -36,7 +35,7 @@ def _save(agent: Agent, path: Path, tensors: dict[str, torch.Tensor]) -> None:
         "algorithm": agent.name,
         "config": json.dumps(dataclasses.asdict(agent.config)),
         "seeds": json.dumps(agent.seeds),
-        "threshold": json.dumps(agent.threshold),
+        "limits": json.dumps(agent.limits),
         "data": json.dumps(agent.data_checksum),
     }
     with written_whole(path) as temporary:
@@ -52,11 +51,12 @@ def load_agent(path: Path | str, device="cpu") -> Agent:
         with safe_open(path, "pt") as file:
             header = file.metadata() or {}
             tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118  (not a mapping)
-        agent = get_algorithm(header["algorithm"])(
+        kind = get_algorithm(header["algorithm"])
+        agent = kind(
             get_task(header["task"]),
-            Config(**json.loads(header["config"])),
+            kind.Config(**json.loads(header["config"])),
             seeds=json.loads(header["seeds"]),
-            threshold=json.loads(header["threshold"]),
+            limits=json.loads(header["limits"]),
             device=device,
         )
         agent.load_state(tensors)
@@ -85,8 +85,8 @@ def resume(agent: Agent, generators: list[torch.Generator], run_dir: Path) -> li
     """Bring agent and generators to the state of the folder's checkpoint; returns the log up to there."""
     path = run_dir / CHECKPOINT
     saved = load_agent(path)
-    mine = (agent.task, agent.name, agent.config, agent.seeds, agent.threshold)
-    if mine != (saved.task, saved.name, saved.config, saved.seeds, saved.threshold):
+    mine = (agent.task, agent.name, agent.config, agent.seeds, agent.limits)
+    if mine != (saved.task, saved.name, saved.config, saved.seeds, saved.limits):
         raise TrainingError(
             f"{path}: is of another run (task, algorithm, options or seeds): choose another folder (--out)"
         )

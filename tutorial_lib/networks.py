@@ -1,6 +1,5 @@
 """Networks for one run; every one takes a leading batch axis B and returns values (B,) or heads (B, m)."""
 
-import copy
 import functools
 import math
 from collections.abc import Callable
@@ -51,28 +50,6 @@ def _scaled(output: Tensor, scale: float | tuple[float, ...]) -> Tensor:
     if isinstance(scale, tuple):
         return (1 + output) * _constant(scale, output.device)
     return (1 + output.squeeze(-1)) * scale
-
-
-class Borrower:
-    """A network without parameters of its own: it computes with those that it is lent.
-
-    What torch.func.functional_call does, which looks every name up again at every call: for networks as small
-    as profile `small`'s that was an eighth of an update's time.
-    """
-
-    def __init__(self, module: nn.Module):
-        self.module = copy.deepcopy(module)
-        self.places = []  # of each parameter: its name, its layer's attributes, its name there
-        for prefix, layer in self.module.named_modules():
-            for name in list(layer._parameters):
-                del layer._parameters[name]
-                self.places.append((f"{prefix}.{name}" if prefix else name, vars(layer), name))
-
-    def lend(self, parameters: dict[str, Tensor]) -> nn.Module:
-        """The network with these parameters, by their names in the module; until others are lent."""
-        for key, attributes, name in self.places:
-            attributes[name] = parameters[key]
-        return self.module
 
 
 class Value(nn.Module):
@@ -193,3 +170,15 @@ class ActionDecoder(nn.Module):
 def latent_kl(mean: Tensor, log_std: Tensor) -> Tensor:
     """KL divergence of N(mean, exp(log_std)) from N(0, 1), the mean over the latent's dimensions: (...,)."""
     return 0.5 * (mean.square() + (2 * log_std).exp() - 2 * log_std - 1).mean(-1)
+
+
+def vae_loss(
+    encoder: ActionEncoder, decoder: ActionDecoder, s: Tensor, a: Tensor, noise: Tensor, kl_weight: float
+) -> Tensor:
+    """Mean squared error of the decoded actions, and `kl_weight` times the KL divergence of the latent, ().
+
+    States s (B, obs), actions a (B, act), standard normal noise (B, 2 act).
+    """
+    mean, log_std = encoder(s, a)
+    decoded = decoder(s, mean + log_std.exp() * noise)
+    return (decoded - a).square().mean() + kl_weight * latent_kl(mean, log_std).mean()

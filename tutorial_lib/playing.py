@@ -1,6 +1,7 @@
 """Agents in the simulator: rollouts under the budget rule, and the raw results of an evaluation."""
 
 import functools
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import joblib
@@ -9,7 +10,7 @@ import pandas as pd
 import torch
 
 from tutorial_lib.agents import Agent
-from tutorial_lib.costs.conditioning import check_threshold, nearest_threshold, rescaled_budget
+from tutorial_lib.costs.conditioning import check_limit
 from tutorial_lib.tasks import make_env
 
 EPISODES_TOGETHER = 10
@@ -24,8 +25,8 @@ class Rollout(NamedTuple):
     """(T, E)"""
     costs: np.ndarray
     """(T, E), 0 or 1"""
-    conditions: np.ndarray
-    """(T, E): the threshold that the policy was given at each step (NaN: the policy takes none)"""
+    told: np.ndarray
+    """(T, E): the limit that the policy was told at each step (NaN: the policy takes none)"""
     positions: np.ndarray
     """(T, E, 2): where the robot was, in metres"""
     lengths: np.ndarray
@@ -34,80 +35,70 @@ class Rollout(NamedTuple):
     """(E,): the cost that the critics expected at the first step (NaN: they cannot tell)"""
 
 
-def condition(agent: Agent, limit: np.ndarray, spent: np.ndarray, t: int) -> np.ndarray:
-    """The threshold that a conditioned agent is given at step t: eq. 23, then the nearest of its set."""
-    task, config = agent.task, agent.config
-    if config.time_limits == "mask":  # its critics speak of the remaining cost: do not rescale the budget
-        budget = limit - spent
-    else:
-        budget = rescaled_budget(limit, spent, t, task.horizon)
-    chosen = nearest_threshold(
-        budget, task, with_infinite=config.infinite_at_test == "nearest", with_zero=config.zero_threshold
-    )
-    if config.infinite_at_test == "covered":
-        chosen = np.where(limit - spent >= task.horizon - t, np.inf, chosen)
-    return chosen
-
-
-def rollout(agent: Agent, limits, seeds, run: int = 0) -> Rollout:
-    """Play one episode per seed with run number `run`'s mean action, all at once, each under its limit."""
+def rollout(agent: Agent, limits, seeds: Sequence[int], run: int = 0) -> Rollout:
+    """Play one episode per seed with run number `run`, all at once, each under its limit."""
     task, count = agent.task, len(seeds)
-    limits = np.array([check_threshold(limit) for limit in np.broadcast_to(limits, count)])
-    envs = _environments(task.name, count)
+    limits = np.array([check_limit(limit) for limit in np.broadcast_to(limits, count)])
+    player, envs = agent.player(limits, seeds, run), _environments(task.name, count)
     observations = np.stack([env.reset(seed=int(seed))[0] for env, seed in zip(envs, seeds, strict=True)])
     rewards, costs = np.zeros((2, task.horizon, count))
-    conditions = np.full((task.horizon, count), np.nan)
+    told = np.full((task.horizon, count), np.nan)
     positions = np.zeros((task.horizon, count, 2))
-    lengths = np.full(count, task.horizon)
-    alive = np.ones(count, bool)
+    lengths, alive = np.full(count, task.horizon), np.ones(count, bool)
+    predicted = player.predicted_cost(observations)
     for t in range(task.horizon):
-        if agent.conditioned:
-            conditions[t] = condition(agent, limits, costs.sum(0), t)
-        if t == 0:
-            predicted = agent.predicted_cost(
-                observations, conditions[0] if agent.conditioned else limits, run
-            )
-        actions = agent.act(observations, conditions[t], run)
+        told[t], actions = player.told, player.act(observations)
         for e in np.flatnonzero(alive):
             observations[e], rewards[t, e], terminated, _, info = envs[e].step(actions[e])
             costs[t, e] = info["cost"]
             positions[t, e] = envs[e].position
             if terminated:
                 alive[e], lengths[e] = False, t + 1
+        player.see(rewards[t], costs[t])
         if not alive.any():
             break
-    return Rollout(rewards, costs, conditions, positions, lengths, predicted)
+    return Rollout(rewards, costs, told, positions, lengths, predicted)
 
 
-def evaluate(agent: Agent, thresholds=None, episodes: int = 10, workers: int = 1, seeds=None) -> pd.DataFrame:
-    """Raw results: one row per run, threshold and episode, by default under the task's three thresholds.
+def evaluate(
+    agent: Agent,
+    limits: Sequence[float] | None = None,
+    episodes: int = 10,
+    workers: int = 1,
+    seeds: Sequence[int] | None = None,
+) -> pd.DataFrame:
+    """Raw results: one row per run, limit and episode, by default under the task's own limits.
 
-    The episodes of a seed start alike under every threshold. More workers give the same rows, sooner.
-    `seeds`: only these of the agent's runs. Raises ValueError for a limit that the agent was not trained
-    for and cannot be told.
+    The episodes of a seed start alike under every limit. More workers give the same rows, sooner. `seeds`:
+    only the runs with these seeds. Raises ValueError for a limit that the agent was not trained for and
+    cannot be told.
     """
-    own = agent.task.thresholds if agent.threshold is None else [agent.threshold]
-    thresholds = own if thresholds is None else thresholds
-    if agent.threshold is not None and set(thresholds) != set(own):
-        raise ValueError(
-            f"{agent.name} was trained for the limit {agent.threshold:g}, and can be told no other"
-        )
     jobs = [
-        (run, threshold, range(first, min(first + EPISODES_TOGETHER, episodes)))
+        (run, limit, range(first, min(first + EPISODES_TOGETHER, episodes)))
         for run, seed in enumerate(agent.seeds)
         if seeds is None or seed in seeds
-        for threshold in thresholds
+        for limit in _limits_of(agent, run, limits)
         for first in range(0, episodes, EPISODES_TOGETHER)
     ]
     frames = joblib.Parallel(n_jobs=workers)(joblib.delayed(_evaluate_job)(agent, *job) for job in jobs)
     return pd.concat(frames, ignore_index=True)
 
 
-def _evaluate_job(agent: Agent, run: int, threshold: float, episodes: range) -> pd.DataFrame:
+def _limits_of(agent: Agent, run: int, limits: Sequence[float] | None) -> Sequence[float]:
+    """The limits that a run plays under: those asked for, its own, or the task's."""
+    if agent.limits is None:
+        return agent.task.thresholds if limits is None else limits
+    if limits is not None and set(limits) != set(agent.limits):
+        own = ", ".join(f"{limit:g}" for limit in dict.fromkeys(agent.limits))
+        raise ValueError(f"{agent.name} was trained for the limit {own}, and can be told no other")
+    return [agent.limits[run]]
+
+
+def _evaluate_job(agent: Agent, run: int, limit: float, episodes: range) -> pd.DataFrame:
     seed, threads = agent.seeds[run], torch.get_num_threads()
     torch.set_num_threads(1)  # small products: more threads are slower, and the workers are the cores
     try:
-        played = rollout(agent, threshold, [1000 * (seed + 1) + episode for episode in episodes], run)
+        played = rollout(agent, limit, [1000 * (seed + 1) + episode for episode in episodes], run)
     finally:
         torch.set_num_threads(threads)
     return pd.DataFrame(
@@ -116,7 +107,7 @@ def _evaluate_job(agent: Agent, run: int, threshold: float, episodes: range) -> 
             "algorithm": agent.name,
             "profile": agent.config.profile,
             "seed": seed,
-            "threshold": threshold,
+            "threshold": limit,
             "episode": list(episodes),
             "return": played.rewards.sum(0),
             "cost": played.costs.sum(0),

@@ -17,7 +17,13 @@ ALGORITHMS: dict[str, type[Agent]] = {
 
 
 def get_algorithm(name: str) -> type[Agent]:
-    """The class of the algorithm called `name`, or ValueError that lists those there are."""
+    """The class of the algorithm with this name or slug, or ValueError that lists those there are."""
+    name = {slug(known): known for known in ALGORITHMS}.get(name, name)
     if name not in ALGORITHMS:
         raise ValueError(f"unknown algorithm {name!r}: the algorithms are {', '.join(ALGORITHMS)}")
     return ALGORITHMS[name]
+
+
+def slug(name: str) -> str:
+    """The algorithm's name as the command line and folders write it, e.g. C2IQL-wo-CR for 'C2IQL w/o CR'."""
+    return name.replace(" ", "-").replace("/", "")

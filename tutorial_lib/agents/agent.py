@@ -1,315 +1,212 @@
-"""What every algorithm shares: networks for several seeds, one optimiser step, acting, saving.
+"""The interface of an algorithm, and what every algorithm shares: one update, acting, saving.
 
-An algorithm is written for one run. `Agent` holds the parameters of S seeds, stacked along a leading
-axis, and lifts the algorithm's `losses` over that axis with torch.func, so several seeds train
-together and the code that is taught is the code that runs.
+An algorithm is written for one run. `Agent` holds S runs, which may differ in their seed and in their limit,
+and computes the algorithm's `draw`, `losses` and `step` for all of them (see `seeds`). The code that is
+taught is the code that runs.
 """
 
-import copy
-from collections.abc import Callable, Sequence
-from types import SimpleNamespace
+import dataclasses
+from collections.abc import Sequence
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import torch
 from torch import Tensor, nn
-from torch.func import functional_call, stack_module_state, vmap
 
-from tutorial_lib import losses as L
+from tutorial_lib.agents import lift
+from tutorial_lib.agents.player import Player
+from tutorial_lib.agents.seeds import Fields, Networks, Rates, Runs
 from tutorial_lib.config import Config
-from tutorial_lib.costs.conditioning import check_threshold
-from tutorial_lib.data.dataset import Batch, Dataset, returns_to_go
-from tutorial_lib.networks import Borrower
+from tutorial_lib.costs.conditioning import check_limit
+from tutorial_lib.data.dataset import Batch, Dataset, sample_batch
 from tutorial_lib.tasks import Task
 
-MEASURED = ("observation_mean", "observation_std", "reward_scale")
-"""What an agent measures on its dataset before the first update, and saves with its networks."""
 
-
-class Agent:
+class Agent(Runs):
     """S runs of one algorithm on one task.
 
-    A subclass names its networks in `build`, its target networks in `targets`, and writes `losses`.
-    `threshold` is the fixed cost limit of algorithms that are trained for one; the conditioned ones
-    (`conditioned = True`) take a limit when they act. Raises ValueError where the two do not fit.
+    Args:
+        task: the task whose data the runs learn from.
+        config: the options, an instance of the class's own `Config`. `configure` makes one.
+        seeds: the seed of each run.
+        limits: the limit on the cost of an episode that each run is trained for: one number, or one per run.
+            Only for algorithms with `needs_limit`.
+        device: where the runs are computed.
+
+    Raises ValueError where seeds, limits or config do not fit.
     """
 
-    name: str
-    conditioned = False  # does the policy take the limit as an input?
-    constrained = True  # does training know a limit at all?
-    can_price = False  # does it read `unsafe_price`?
-    targets: tuple[str, ...] = ()  # networks with a Polyak-averaged copy
-    frozen: tuple[str, ...] = ()  # networks that a loss looks through without training them
+    name: ClassVar[str]
+    Config: ClassVar[type[Config]] = Config
+    needs_limit: ClassVar[bool] = False
+    """Is a run trained for one limit? If not, it knows no limit, or is told one when it plays."""
+    in_table1: ClassVar[bool] = True
+    """Is it a row of Table 1? Ablations and building blocks are not."""
+    at_test: ClassVar[tuple[str, ...]] = ()
+    """Options that only `player` reads: agents that differ in nothing else are trained alike."""
 
     def __init__(
         self,
         task: Task,
         config: Config,
         seeds: Sequence[int] = (0,),
-        threshold: float | None = None,
-        device="cpu",
+        limits: float | Sequence[float] | None = None,
+        device: torch.device | str = "cpu",
     ):
-        needs_threshold = self.constrained and not self.conditioned
-        if needs_threshold != (threshold is not None):
-            verb = (
-                "is trained for one threshold: give it one"
-                if needs_threshold
-                else "takes no threshold to train"
+        if type(config) is not self.Config:
+            raise ValueError(
+                f"{self.name} takes a {self.Config.__name__}, not a {type(config).__name__}: "
+                f"make one with {type(self).__name__}.configure()"
             )
-            raise ValueError(f"{self.name} {verb}")
-        self.task, self.config, self.seeds, self.device = task, config, tuple(seeds), torch.device(device)
-        if not self.seeds or min(self.seeds) < 0 or len(set(self.seeds)) < len(self.seeds):
-            raise ValueError(f"seeds {list(self.seeds)}: at least one, each 0 or more and there once")
-        self.threshold = None if threshold is None else check_threshold(threshold)
+        self.task, self.config, self.device = task, config, torch.device(device)
+        self.seeds = tuple(seeds)
+        self.limits = self._check_limits(limits)
+        runs = list(zip(self.seeds, self.limits or self.seeds, strict=True))
+        if not runs or min(self.seeds) < 0 or len(set(runs)) < len(runs):
+            raise ValueError(
+                f"seeds {list(self.seeds)}: at least one, each 0 or more and there once per limit"
+            )
+        self.build_runs()
+        self.data_checksum: str | None = None  # of the dataset that the runs were trained on
 
-        self.observation_mean = torch.zeros(task.obs_dim, device=self.device)
-        self.observation_std = torch.ones(task.obs_dim, device=self.device)
-        self.reward_scale = torch.tensor(reward_guess(task, config), device=self.device)
-        runs = [self._build_seeded(seed) for seed in self.seeds]
-        self.modules = {name: copy.deepcopy(net).to("meta") for name, net in runs[0].items()}
-        self.parameters = {name: stack_module_state([run[name] for run in runs])[0] for name in self.modules}
-        self.parameters = _map(self.parameters, lambda p: p.detach().to(self.device).requires_grad_())
-        self.target_parameters = _map(
-            {n: self.parameters[n] for n in self.targets}, lambda p: p.detach().clone()
-        )
-        self.optimiser = torch.optim.Adam(
-            [
-                {
-                    "params": list(params.values()),
-                    "lr": self.learning_rate(name),
-                    "base_lr": self.learning_rate(name),
-                }
-                for name, params in self.parameters.items()
-            ],
-            fused=True,
-        )
-        self.borrowers = {name: Borrower(net) for name, net in self.modules.items()}
-        self.borrowers |= {f"target_{name}": Borrower(self.modules[name]) for name in self.targets}
-        self.borrowers |= {f"frozen_{name}": Borrower(self.modules[name]) for name in self.frozen}
-        self.updates = 0
-        self.data_checksum: str | None = None  # of the dataset that it was trained on
+    # What an algorithm writes ------------------------------------------------------------------------
 
-    # What a subclass writes -------------------------------------------------------------------------
+    def build(self) -> dict[str, nn.Module | Tensor]:
+        """The networks of one run, and its variables, by name.
 
-    def build(self) -> dict[str, nn.Module]:
-        """The networks of one run, by name."""
-        raise NotImplementedError
+        A variable is a plain tensor that no optimiser changes: a multiplier, say, or a statistic of the
+        A variable is a plain tensor that no optimiser changes: a multiplier, say, or a statistic of the
+        dataset. It is saved with the networks. `measure` may set it before the first update, `step` after
+        every update.
+        """
+        zeros = torch.zeros(self.task.obs_dim)
+        return {"observation_mean": zeros, "observation_std": torch.ones_like(zeros)}
 
-    def losses(
-        self, net: SimpleNamespace, batch: Batch, limit: Tensor, *noise: Tensor
-    ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-        """One run's losses and other scalars on a batch of B transitions.
+    def select(self, dataset: Dataset, limit: float) -> Dataset:
+        """The data that a run with this limit learns from, (a part of) the dataset; the run sees no other.
 
-        `net` holds the networks by name, the target networks as `target_<name>` and those named in
-        `frozen` as `frozen_<name>`: the online network, whose parameters get no gradient. `limit` is the
-        cost limit of each transition (B,), `noise` is what `draw_noise` drew. Every loss must reach only
-        the network that it trains.
+        Actions are kept a hair inside their bounds, as in IQL's code: a Gaussian policy with a tanh mean
+        cannot reach an action of exactly one.
+        """
+        return dataclasses.replace(dataset, actions=np.clip(dataset.actions, -1 + 1e-5, 1 - 1e-5))
+
+    def measure(self, dataset: Dataset) -> dict[str, Tensor]:
+        """Variables of one run that depend on the data it learns from, by name."""
+        if not self.config.normalise_observations:
+            return {}
+        mean, std = dataset.observations.mean(0), dataset.observations.std(0)
+        return {"observation_mean": torch.tensor(mean), "observation_std": torch.tensor(std) + 1e-3}
+
+    def prepare(self, datasets: Sequence[Dataset], progress: bool = True) -> None:
+        """What must be learned before the first update, from the selected dataset of each run."""
+        measured = {id(dataset): self.measure(dataset) for dataset in datasets}
+        for run, dataset in enumerate(datasets):
+            for name, value in measured[id(dataset)].items():
+                self.variables[name][run] = value.to(self.device)
+
+    def draw(self, data: Batch, generator: torch.Generator, limit: float) -> dict[str, Tensor]:
+        """Everything random that one run's update sees, by name: by default a batch of transitions and its
+        limit.
+
+        `data` are all transitions that the run learns from, on the agent's device. All draws come from
+        `generator`, which is on the CPU, so that they are the same on every device. Each value has the same
+        shape in every run.
+        """
+        batch = sample_batch(data, self.config.batch_size, generator)._asdict()
+        return batch | {"limit": torch.full((self.config.batch_size,), limit)}
+
+    def losses(self, net: Networks, batch: Fields) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        """One run's losses and other scalars to be logged, by name, on what `draw` returned.
+
+        Every loss must reach only the network that it trains.
         """
         raise NotImplementedError
 
-    def select_episodes(self, dataset: Dataset) -> Dataset:
-        """The part of the dataset that this algorithm learns from; `prepare` and training see no other."""
-        return dataset
+    def step(self, net: Networks, batch: Fields, scalars: dict[str, Tensor]) -> dict[str, Tensor]:
+        """New values of variables of one run, by name, after an update of its networks."""
+        return {}
 
-    def prepare(self, dataset: Dataset, progress: bool = True) -> None:
-        """Whatever must be learned from the whole dataset before the first update."""
-        if self.config.normalise_observations:
-            self.observation_mean = self._tensor(dataset.observations.mean(0))
-            self.observation_std = self._tensor(dataset.observations.std(0)) + 1e-3
-        self.reward_scale = self._tensor(abs(returns_to_go(dataset, self.config.gamma).mean()))
+    def optimiser(self, name: str) -> Rates:
+        """How Adam changes the network called `name`."""
+        raise NotImplementedError
 
-    def draw_limits(self, generator: torch.Generator, batch_size: int) -> Tensor:
-        """The cost limits of one run's batch, (B,)."""
-        return torch.full((batch_size,), torch.inf if self.threshold is None else self.threshold)
+    def tau(self, name: str) -> float:
+        """The Polyak step of the target network of the network called `name`."""
+        raise NotImplementedError
 
-    def draw_noise(self, generator: torch.Generator, batch_size: int) -> tuple[Tensor, ...]:
-        """The random numbers that one run's losses need for a batch, drawn as its limits are; none here."""
-        return ()
+    def network_input(self, net: Networks, observations: Tensor, limit: Tensor) -> Tensor:
+        """What the networks see of observations (..., obs) and limits (...): the normalised observations."""
+        return (observations - net.observation_mean) / net.observation_std
 
-    def learning_rate(self, name: str) -> float:
-        """The learning rate of the network called `name` (Table 4)."""
-        if name == "policy":
-            return self.config.policy_lr
-        return self.config.critic_lr if "critic" in name else self.config.value_lr
+    def player(self, limits: np.ndarray, seeds: Sequence[int], run: int = 0) -> Player:
+        """Plays E episodes of one run at once, under limits (E,); its chances come from seeds (E,)."""
+        return Player(self, limits, run)
 
-    def network_input(self, observations: Tensor, limit: Tensor) -> Tensor:
-        """What every network sees: the observation, for conditioned agents with the encoded limit."""
-        return (observations - self.observation_mean) / self.observation_std
-
-    def reward_mask(self, batch: Batch) -> Tensor:
-        """1 where Q_r bootstraps, 0 where nothing follows, (B,)."""
-        return _goes_on(batch, self.config.reward_time_limits)
-
-    def cost_mask(self, batch: Batch) -> Tensor:
-        """1 where Q_c bootstraps, 0 where nothing follows, (B,)."""
-        return _goes_on(batch, self.config.time_limits)
-
-    def guess_costs(self, dataset: Dataset) -> None:
-        """All cost heads start at the dataset's own cost rate.
-
-        The closer the first guess, the less they disagree while they converge, and a reconstruction lives on
-        their differences.
-        """
-        guess = float(dataset.costs.mean()) * self.task.horizon / self.task.thresholds[1]
-        self.fill_last_bias(("cost_value", "cost_critics"), guess - 1)
-
-    def penalised_q(self, q_reward: Tensor, cost: Tensor, value_cost: Tensor, limit: Tensor) -> Tensor:
-        """Eq. 11, or our variant with a price: Q_r, episode cost and limit (B,), and V_c's heads (B, m)."""
-        if self.config.unsafe_price is None:
-            return L.penalised_q(q_reward, cost, limit)
-        price = self.config.unsafe_price * self.reward_scale / self.task.cost_range
-        return L.priced_q(q_reward, cost, self.episode_cost(value_cost.detach()), limit, price)
-
-    # What they all share ----------------------------------------------------------------------------
-
-    def update(self, batch: Batch, generators: Sequence[torch.Generator]) -> dict[str, Tensor]:
-        """One gradient step of every run; batch fields are (S, B, ...). Returns named scalars, each (S,).
-
-        All losses look at the same, old parameters, then all networks step at once: the policy and
-        the targets of Q see V from before this step. (IQL's code updates V first; at these learning
-        rates the difference is one step's worth, and one joint step is faster.)
-        """
-        size = batch.rewards.shape[1]
-        limits = torch.stack([self.draw_limits(g, size) for g in generators])
-        limits = limits.to(self.device, non_blocking=True)  # a GPU is fed, not waited for
-        noise = zip(*[self.draw_noise(g, size) for g in generators], strict=True)  # by kind, not by run
-        noise = [torch.stack(runs).to(self.device, non_blocking=True) for runs in noise]
-        rounded = self.config.precision == "bfloat16"
-        with torch.autocast(self.device.type, torch.bfloat16, enabled=rounded):
-            loss, scalars = self._lifted(batch, limits, *noise)
-        self.optimiser.zero_grad()
-        loss.sum().backward()  # runs share no parameter, so each gets its own gradient
-        for group in self.optimiser.param_groups:
-            group["lr"] = group["base_lr"]
-        self.optimiser.param_groups[list(self.parameters).index("policy")]["lr"] *= self._cosine()
-        self.optimiser.step()
-        with torch.no_grad():  # or the targets would remember how they came about, for ever
-            for name, averages in self.target_parameters.items():
-                torch._foreach_lerp_(
-                    list(averages.values()), list(self.parameters[name].values()), self.config.target_tau
-                )
-        self.updates += 1
-        return scalars
-
-    def act(self, observations, limit, run: int = 0) -> np.ndarray:
-        """Mean actions (E, act) of run number `run` at observations (E, obs) under cost limits (E,)."""
-        with torch.no_grad():
-            x = self._tensor(observations), self._tensor(limit)
-            mean, _ = self.network("policy", run)(self.network_input(*x))
-            return mean.cpu().numpy()
-
-    def predicted_cost(self, observations, limit, run: int = 0) -> np.ndarray:
-        """The episode cost that the critics expect of the policy's action, (E,); NaN from all but C2IQL."""
+    def predicted_cost(self, observations: np.ndarray, limits: np.ndarray, run: int = 0) -> np.ndarray:
+        """The cost of an episode that the run expects of its action now, (E,); NaN: it cannot tell."""
         return np.full(len(observations), np.nan)
 
-    def fill_last_bias(self, names: Sequence[str], value: float) -> None:
-        """Set the output bias of these networks, and of their target networks, in every run."""
-        with torch.no_grad():
-            for parameters in (self.parameters, self.target_parameters):
-                for name in set(names) & set(parameters):
-                    list(parameters[name].values())[-1].fill_(value)
+    def diagnose(self, dataset: Dataset) -> dict[str, float]:
+        """Numbers that describe the trained agent on its dataset, by name, for studies that ask for them."""
+        return {}
 
-    def network(self, name: str, run: int = 0) -> Callable[..., Tensor]:
-        """One network of one run, to be called."""
-        own = {key: value[run].detach() for key, value in self.parameters[name].items()}
-        return lambda *inputs: functional_call(self.modules[name], own, inputs)
+    def check(self, log: list[dict[str, Any]]) -> None:
+        """Warns of what went wrong in a finished training, whose log this is."""
 
-    def state(self) -> dict[str, Tensor]:
-        """Every tensor of the agent by a flat name: online.*, target.*, adam.* and the number of updates."""
-        tensors = {f"online.{n}.{k}": v.detach() for n, p in self.parameters.items() for k, v in p.items()}
-        tensors |= {f"target.{n}.{k}": v for n, p in self.target_parameters.items() for k, v in p.items()}
-        for index, moments in self.optimiser.state_dict()["state"].items():
-            tensors |= {f"adam.{index}.{key}": value for key, value in moments.items()}
-        for name in MEASURED:
-            tensors[name] = getattr(self, name)
-        return tensors | {"updates": torch.tensor(self.updates)}
+    # What they all share -----------------------------------------------------------------------------
 
-    def load_state(self, tensors: dict[str, Tensor]) -> None:
-        """The inverse of `state`. Without adam.* and target.* the agent can act, and train on only afresh.
+    @classmethod
+    def configure(cls, profile: str = "small", task: Task | None = None, **changes: Any) -> Config:
+        """The options of a profile, with the task's own where one is given, and with `changes` made last.
 
-        Raises KeyError for a missing tensor, ValueError for one of another shape.
+        Raises ValueError for an unknown profile, an option that the algorithm does not read, or a value out
+        of its bounds.
         """
+        return cls.Config.make(profile, None if task is None else task.name).changed(**changes)
 
-        def put(place: Tensor, value: Tensor) -> None:
-            if value.shape != place.shape:  # copy_ would repeat one run for all
-                raise ValueError(f"a tensor of shape {tuple(value.shape)} where {tuple(place.shape)} belongs")
-            place.copy_(value)
+    def draw_all(self, data: Sequence[Batch], generators: Sequence[torch.Generator]) -> dict[str, Tensor]:
+        """What `draw` returns for each run, from its own data and generator, stacked: (S, ...)."""
+        limits = self.limits or (float("inf"),) * len(self.seeds)
+        runs = [self.draw(*run) for run in zip(data, generators, limits, strict=True)]
+        stack = {name: torch.stack([run[name] for run in runs]) for name in runs[0]}
+        return lift.map_tensors(stack, lambda x: x.to(self.device, non_blocking=True))
 
+    def act(self, observations: np.ndarray, limits: np.ndarray, run: int = 0) -> np.ndarray:
+        """Mean actions (E, act) of one run at observations (E, obs) under limits (E,), by network
+        `policy`."""
         with torch.no_grad():
-            for name, params in self.parameters.items():
-                for key, value in params.items():
-                    put(value, tensors[f"online.{name}.{key}"])
-            for name, params in self.target_parameters.items():
-                for key, value in params.items():
-                    put(value, tensors.get(f"target.{name}.{key}", self.parameters[name][key]))
-        state = self.optimiser.state_dict() | {"state": {}}
-        for key, value in tensors.items():
-            if key.startswith("adam."):
-                _, index, moment = key.split(".")
-                state["state"].setdefault(int(index), {})[moment] = value
-        self.optimiser.load_state_dict(state)
-        for name in MEASURED:
-            getattr(self, name).copy_(tensors[name])
-        self.updates = int(tensors["updates"])
+            net, x = self.networks(run), (self._tensor(observations), self._tensor(limits))
+            mean, _ = net.policy(self.network_input(net, *x))
+            return mean.cpu().numpy()
 
-    def __getstate__(self):
-        """What a worker process needs to act: without the optimiser and the lent networks."""
-        return {key: value for key, value in vars(self).items() if key not in ("optimiser", "borrowers")}
+    def playing_with(self, **changes: Any) -> Self:
+        """The same trained agent with other values of options that only its player reads (`at_test`)."""
+        if unread := set(changes) - set(self.at_test):
+            raise ValueError(
+                f"{self.name}: {', '.join(sorted(unread))}: training reads this, not only playing"
+            )
+        other = type(self).__new__(type(self))
+        vars(other).update(vars(self) | {"config": self.config.changed(**changes)})
+        return other
 
-    def _build_seeded(self, seed: int) -> dict[str, nn.Module]:
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(seed)
-            return self.build()
+    @property
+    def steps_variables(self) -> bool:
+        """Does the algorithm write `step`?"""
+        return type(self).step is not Agent.step
 
-    def _lifted(self, batch: Batch, limits: Tensor, *noise: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        """`_total` of every run: losses (S,), and scalars, each (S,)."""
-        lent = self.parameters, self.target_parameters
-        if len(self.seeds) > 1:
-            return vmap(self._total)(*lent, batch, limits, *noise)
-        # Without the lift, which is not free.
-        squeezed = (_map(p, lambda x: x.squeeze(0)) for p in lent)  # x[0] would have its gradient copied
-        own = Batch(*(x[0] for x in batch)), limits[0], *(x[0] for x in noise)
-        loss, scalars = self._total(*squeezed, *own)
-        return loss, {name: value[None] for name, value in scalars.items()}
+    def _check_limits(self, limits: float | Sequence[float] | None) -> tuple[float, ...] | None:
+        """One limit per run, or None for algorithms that are trained for none."""
+        if self.needs_limit != (limits is not None):
+            verb = "is trained for one limit: give it one" if self.needs_limit else "takes no limit to train"
+            raise ValueError(f"{self.name} {verb}")
+        if limits is None:
+            return None
+        limits = [limits] * len(self.seeds) if isinstance(limits, int | float) else list(limits)
+        if len(limits) != len(self.seeds):
+            raise ValueError(
+                f"{len(limits)} limits for {len(self.seeds)} seeds: give one limit, or one per seed"
+            )
+        return tuple(check_limit(limit) for limit in limits)
 
-    def _total(
-        self, parameters, target_parameters, batch: Batch, limit: Tensor, *noise: Tensor
-    ) -> tuple[Tensor, dict[str, Tensor]]:
-        """One run's losses, summed, and its scalars, as a function of its parameters."""
-        target = {f"target_{name}": p for name, p in target_parameters.items()}
-        frozen = {f"frozen_{name}": _detached(parameters[name]) for name in self.frozen}
-        lent = parameters | target | frozen
-        net = SimpleNamespace(**{name: self.borrowers[name].lend(p) for name, p in lent.items()})
-        losses, scalars = self.losses(net, batch, limit, *noise)
-        scalars = {f"{name}_loss": loss for name, loss in losses.items()} | scalars
-        return sum(losses.values()), {name: value.detach() for name, value in scalars.items()}
-
-    def _cosine(self) -> float:
-        return 0.5 * (1 + np.cos(np.pi * min(self.updates / self.config.steps, 1)))
-
-    def _tensor(self, x) -> Tensor:
+    def _tensor(self, x: Any) -> Tensor:
         return torch.as_tensor(np.asarray(x, np.float32), device=self.device)
-
-
-def _goes_on(batch: Batch, time_limits: str) -> Tensor:
-    return 1 - (torch.maximum(batch.terminals, batch.timeouts) if time_limits == "mask" else batch.terminals)
-
-
-def reward_guess(task: Task, config: Config) -> float:
-    """A first guess of Q_r and V_r: half of DSRL's best mean reward per step, for ever."""
-    return 0.5 * task.max_return / task.horizon / (1 - config.gamma)
-
-
-def cost_guess(task: Task, gammas: Sequence[float]) -> tuple[float, ...]:
-    """A first guess of the m heads of Q_c and V_c: the cost rate of the middle threshold, for ever."""
-    rate = task.thresholds[1] / task.horizon
-    return tuple(rate / (1 - gamma) for gamma in gammas)
-
-
-def _detached(parameters: dict[str, Tensor]) -> dict[str, Tensor]:
-    return {key: value.detach() for key, value in parameters.items()}
-
-
-def _map(parameters, function):
-    return {
-        name: {key: function(value) for key, value in params.items()} for name, params in parameters.items()
-    }

@@ -1,42 +1,67 @@
-"""Implicit Q-learning (Kostrikov et al. 2022), for rewards only: what CIQL and C2IQL start from."""
+"""Implicit Q-learning (IQL), for rewards only: what CIQL and C2IQL start from.
 
-from tutorial_lib import losses as L
-from tutorial_lib.agents.agent import Agent, reward_guess
+Sources: Kostrikov, Nair and Levine 2022; equations 6, 7 and 8 of the C2IQL paper.
+
+Departures:
+
+1. All networks step at once on losses of the same, old parameters. IQL's code updates V first, then the
+   policy, then Q. At these learning rates the difference is one step's worth.
+2. A time limit ends the backup (`reward_time_limits`), as in OSRL; IQL's code bootstraps through it.
+"""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from tutorial_lib import losses
+from tutorial_lib.agents.critic import reward_guess
+from tutorial_lib.agents.implicit import ImplicitAgent, ImplicitConfig
+from tutorial_lib.config import NOT_NEGATIVE
 from tutorial_lib.networks import Critics, Policy, Value, gaussian_log_prob
 
 
-class IQL(Agent):
-    """Equations 6, 7 and 8. It takes no cost limit: it is the family's unconstrained member."""
+@dataclass(frozen=True)
+class IQLConfig(ImplicitConfig):
+    """The options of IQL."""
+
+    awr_alpha: Annotated[float, NOT_NEGATIVE] = 3.0
+    """Temperature of the policy extraction (eq. 8), on rewards scaled to a range of returns of 1000
+    (IQL's)."""
+
+
+class IQL(ImplicitAgent):
+    """Equations 6, 7 and 8. It takes no limit: it is the family's unconstrained member."""
 
     name = "IQL"
-    constrained = False
-    targets = ("critics",)
+    Config = IQLConfig
+    in_table1 = False
+    config: IQLConfig
 
     def build(self):
         task, config = self.task, self.config
         scale = reward_guess(task, config)
-        return {
+        return super().build() | {
             "value": Value(task.obs_dim, config, scale),
             "critics": Critics(task.obs_dim, task.act_dim, config, scale),
             "policy": Policy(task.obs_dim, task.act_dim, config),
         }
 
-    def losses(self, net, batch, limit):
-        a = batch.actions
-        s, s_next = (self.network_input(x, limit) for x in (batch.observations, batch.next_observations))
+    def losses(self, net, batch):
+        config, a = self.config, batch.actions
+        s = self.network_input(net, batch.observations, batch.limit)
+        s_next = self.network_input(net, batch.next_observations, batch.limit)
 
+        # Eq. 6: value function.
         q = net.target_critics(s, a).amin(0)
         v = net.value(s)
-        value_loss = L.expectile_loss(q, v, self.config.kappa_1)  # eq. 6
+        value_loss = losses.expectile_loss(q, v, config.kappa_1)
 
-        mask = self.reward_mask(batch)
-        target = L.td_target(batch.rewards, self.config.gamma, net.value(s_next), mask)  # eq. 7
-        critic_loss = L.td_loss(target, net.critics(s, a))
+        # Eq. 7: Q-value function.
+        target = losses.td_target(batch.rewards, config.gamma, net.value(s_next), self.reward_mask(batch))
+        critic_loss = losses.td_loss(target, net.critics(s, a))
 
-        weight = L.awr_weight(
-            (q - v) * 1000 / (self.task.max_return - self.task.min_return), self.config.awr_alpha
-        )
-        policy_loss = L.policy_loss(weight, gaussian_log_prob(a, *net.policy(s)))  # eq. 8
+        # Eq. 8: policy extraction.
+        advantage = (q - v) * 1000 / (self.task.max_return - self.task.min_return)
+        weight = losses.awr_weight(advantage, config.awr_alpha)
+        policy_loss = losses.policy_loss(weight, gaussian_log_prob(a, *net.policy(s)))
 
-        losses = {"value": value_loss, "critic": critic_loss, "policy": policy_loss}
-        return losses, {"value_mean": v.mean()}
+        return {"value": value_loss, "critic": critic_loss, "policy": policy_loss}, {"value_mean": v.mean()}

@@ -5,12 +5,15 @@ linear least squares on the same data, which is nearly exact on clean inputs; th
 keeps either from answering with large weights of alternating sign that amplify the critics' errors.
 """
 
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
 import numpy as np
 import torch
 from torch import Tensor, nn
 from tqdm.auto import trange
 
-from tutorial_lib.config import Config
+from tutorial_lib.config import NOT_NEGATIVE, Config
 from tutorial_lib.costs.discounting import cost_sequences, discounted_sums, random_cost_sequences
 from tutorial_lib.data.dataset import Dataset
 from tutorial_lib.networks import Output, in_float32, mlp
@@ -18,6 +21,37 @@ from tutorial_lib.tasks import Task
 
 POOL = 60_000
 """Random sequences, drawn once: generating new ones for every batch costs more than learning from them."""
+
+
+@dataclass(frozen=True)
+class ReconstructionConfig(Config):
+    """The options of the cost reconstruction model (Appendix B.2)."""
+
+    crm: Literal["mlp", "linear"] = "mlp"
+    """'linear' is the least-squares baseline on the same data and noise."""
+    crm_width: Annotated[int, NOT_NEGATIVE] = 512
+    """Units of each hidden layer."""
+    crm_layers: Annotated[int, NOT_NEGATIVE] = 5
+    """Hidden layers; 0: a linear network, trained."""
+    crm_steps: Annotated[int, NOT_NEGATIVE] = 1_000_000
+    """Iterations of Algorithm 1. The paper says epochs, but one pass over random data has no end. A million
+    of them at 5 x 512 are twice the arithmetic of all updates; on whitened inputs 20,000 at 3 x 128 do
+    (`data/README.md`, "Profile `paper`")."""
+    crm_noise: Annotated[float, NOT_NEGATIVE] = 0.1
+    """Standard deviation of the noise on the model's inputs, in discounted cost."""
+    crm_noise_rate: Annotated[float, NOT_NEGATIVE] = 0.0
+    """More noise, in cost per step: head i gets this over 1 - gamma_i. The paper has none. The model should
+    expect the error that the critics make. Theirs is about 0.01 after some thousand updates, ten times what
+    0.1 allows for, and the model's weights, which alternate in sign, multiply it."""
+
+    profiles = {
+        "small": {"crm_width": 64, "crm_layers": 2, "crm_steps": 5_000, "crm_noise_rate": 0.01},
+    }
+
+    def __post_init__(self):
+        super().__post_init__()
+        if self.crm == "mlp" and self.crm_width == 0:
+            raise ValueError("crm_width is 0, and must be 1 or more where crm is not 'linear'")
 
 
 class CostReconstruction(nn.Module):
@@ -28,7 +62,7 @@ class CostReconstruction(nn.Module):
     training data): the same network then learns in thousands of steps what it else needs a million for.
     """
 
-    def __init__(self, task: Task, config: Config):
+    def __init__(self, task: Task, config: ReconstructionConfig):
         super().__init__()
         m = len(task.gammas)
         self.horizon = task.horizon
@@ -56,14 +90,19 @@ def random_sums(task: Task, n: int, rng: np.random.Generator) -> tuple[np.ndarra
     return discounted_sums(costs, task.gammas), costs.sum(1)
 
 
-def input_noise(task: Task, config: Config) -> Tensor:
+def input_noise(task: Task, config: ReconstructionConfig) -> Tensor:
     """Standard deviations of the noise on the m inputs, (m,), in discounted cost."""
     rate = config.crm_noise_rate / (1 - torch.tensor(task.gammas, dtype=torch.float64))
     return (config.crm_noise**2 + rate**2).sqrt()
 
 
 def train_reconstruction(
-    task: Task, config: Config, dataset: Dataset, seed: int = 0, device="cpu", progress: bool = True
+    task: Task,
+    config: ReconstructionConfig,
+    dataset: Dataset,
+    seed: int = 0,
+    device="cpu",
+    progress: bool = True,
 ) -> CostReconstruction:
     """Algorithm 1. Half of every batch are the dataset's episodes, half random sequences."""
     rng = np.random.default_rng(seed)
@@ -111,7 +150,7 @@ def train_reconstruction(
 
 
 def reconstruction_error(
-    model: CostReconstruction, task: Task, config: Config, dataset: Dataset, seed: int = 1
+    model: CostReconstruction, task: Task, config: ReconstructionConfig, dataset: Dataset, seed: int = 1
 ) -> float:
     """Root of the mean squared error, in cost, on the noise that the model was trained for.
 

@@ -4,13 +4,11 @@ Everything here is exact: chances are followed through all steps, budgets and ce
 """
 
 import dataclasses
-from types import SimpleNamespace
 
 import numpy as np
 
-from tutorial_lib.config import Config
+from tutorial_lib.costs.conditioning import ConditioningConfig, told_limit
 from tutorial_lib.course import tabular
-from tutorial_lib.playing import condition
 from tutorial_lib.tasks import get_task
 
 TASK = dataclasses.replace(
@@ -32,15 +30,14 @@ def policies(thresholds, bias: float = 1.0) -> dict[float, np.ndarray]:
     return {limit: tabular.rate_policy(cmdp, cost, TASK.horizon) for limit, cost in costs.items()}
 
 
-def told(config: Config, limit: float) -> np.ndarray:
-    """The threshold told at each step after each sum spent, (T, T+1), by `evaluation.condition`."""
-    agent = SimpleNamespace(task=TASK, config=config)
+def told(config: ConditioningConfig, limit: float) -> np.ndarray:
+    """The limit told at each step after each sum spent, (T, T+1), by `conditioning.told_limit`."""
     spent = np.arange(TASK.horizon + 1.0)
     limits = np.full(len(spent), float(limit))
-    return np.stack([condition(agent, limits, spent, t) for t in range(TASK.horizon)])
+    return np.stack([told_limit(TASK, config, limits, spent, t) for t in range(TASK.horizon)])
 
 
-def follow_rule(config: Config, agent: dict[float, np.ndarray], limit: float) -> tabular.Spending:
+def follow_rule(config: ConditioningConfig, agent: dict[float, np.ndarray], limit: float) -> tabular.Spending:
     """What an agent, a policy per threshold, earns and pays as the budget rule tells it what is left."""
     thresholds = told(config, limit)
     choices, where = np.unique(thresholds, return_inverse=True)

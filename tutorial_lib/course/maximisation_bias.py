@@ -8,11 +8,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tutorial_lib.agents.cpq import _vae_loss
 from tutorial_lib.config import Config
-from tutorial_lib.data.dataset import Batch, Dataset, sample_batch
+from tutorial_lib.data.dataset import Dataset, sample_batch
 from tutorial_lib.losses import expectile_loss, td_loss, td_target
-from tutorial_lib.networks import ActionDecoder, ActionEncoder, Critics, Value, latent_kl
+from tutorial_lib.networks import ActionDecoder, ActionEncoder, Critics, Value, latent_kl, vae_loss
 from tutorial_lib.tasks import make_env
 
 
@@ -96,7 +95,7 @@ def train_critic(
     optimiser = torch.optim.Adam(online, learning_rate)
     notes = []
     for update in range(updates + 1):
-        batch = Batch(*(field[0] for field in sample_batch(data, 256, [generator])))
+        batch = sample_batch(data, 256, generator)
         with torch.no_grad():
             mask = (1 - batch.terminals) * (1 - batch.timeouts)
             following = next_value(critic, batch.next_observations, generator)
@@ -153,7 +152,7 @@ def latent_divergences(dataset: Dataset, updates: int = 400, width: int = 200, n
         rows = torch.randint(len(s), (256,), generator=generator)
         noise = torch.randn(256, 2 * sizes[1], generator=generator)
         optimiser.zero_grad()
-        _vae_loss(encoder, decoder, s[rows], a[rows], noise).backward()
+        vae_loss(encoder, decoder, s[rows], a[rows], noise, kl_weight=0.5).backward()
         optimiser.step()
     rows = torch.randint(len(s), (n,), generator=generator)
     random = 2 * torch.rand(n, sizes[1], generator=generator) - 1

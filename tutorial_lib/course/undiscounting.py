@@ -52,12 +52,13 @@ def steady_heads(task: Task, cost: float, time_limits: str = "rate", step: int =
 def critic_heads(agent, dataset: Dataset, n: int, seed: int = 0) -> np.ndarray:
     """What a trained agent's first cost critic gives the reconstruction for n recorded actions, (n, m).
 
-    Under its middle threshold, on rows drawn at random, and scaled as option `time_limits` says.
+    Under the task's typical limit, on rows drawn at random, and scaled as option `time_limits` says.
     """
     rows = np.random.default_rng(seed).choice(len(dataset), n, replace=False)
-    limits = torch.full((n,), float(agent.task.thresholds[1]))
-    s = agent.network_input(torch.tensor(dataset.observations[rows]), limits)
-    q = agent.network("cost_critics")(s, torch.tensor(dataset.actions[rows]))[0].detach().double().numpy()
+    limits = torch.full((n,), float(agent.task.typical_limit))
+    net = agent.networks()
+    s = agent.network_input(net, torch.tensor(dataset.observations[rows]), limits)
+    q = net.cost_critics(s, torch.tensor(dataset.actions[rows]))[0].detach().double().numpy()
     gammas = np.asarray(agent.task.gammas)
     return q * (1 - gammas**agent.task.horizon) if agent.config.time_limits == "rate" else q
 

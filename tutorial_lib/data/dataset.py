@@ -6,7 +6,6 @@ merged: after a terminal nothing follows, whereas a time limit only ends the rec
 """
 
 import hashlib
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import NamedTuple
@@ -115,22 +114,14 @@ class Dataset:
         return Batch(**{key: torch.tensor(getattr(self, key), **options) for key in KEYS})
 
 
-def sample_batch(data: Batch, batch_size: int, generators: Sequence[torch.Generator]) -> Batch:
-    """A batch for each of S runs, (S, batch_size, ...): rows of `data`, uniform, with replacement.
+def sample_batch(data: Batch, batch_size: int, generator: torch.Generator) -> Batch:
+    """`batch_size` rows of `data`, uniform, with replacement: observations (batch_size, obs) and so on.
 
-    Every run draws from its own CPU generator, so its batches depend neither on the runs beside it nor
-    on the device of the data.
+    The generator is on the CPU, so that the rows do not depend on the device of the data.
     """
-    count = len(data.rewards)
-    rows = torch.stack([torch.randint(count, (batch_size,), generator=generator) for generator in generators])
-    flat = rows.flatten().to(data.rewards.device, non_blocking=True)
-    return Batch(*(values.index_select(0, flat).unflatten(0, rows.shape) for values in data))
-
-
-# --- Files ---
-
-
-# --- Where datasets are ---
+    rows = torch.randint(len(data.rewards), (batch_size,), generator=generator)
+    rows = rows.to(data.rewards.device, non_blocking=True)
+    return Batch(*(values.index_select(0, rows) for values in data))
 
 
 def returns_to_go(dataset: Dataset, gamma: float, after_timeout=0.0) -> np.ndarray:

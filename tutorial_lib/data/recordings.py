@@ -4,15 +4,6 @@ import numpy as np
 
 from tutorial_lib.data.dataset import Dataset
 
-METRES = 10.0
-"""Observations begin with the robot's x and y in units of 10 m, for all robots of Bullet-Safety-Gym."""
-
-
-def positions(dataset: Dataset, after: bool = True) -> np.ndarray:
-    """Where the robot was, (N, 2) in metres: after each step, where its cost is decided, or before it."""
-    observations = dataset.next_observations if after else dataset.observations
-    return METRES * observations[:, :2]
-
 
 def best_left(dataset: Dataset, limits) -> tuple[np.ndarray, np.ndarray]:
     """BC-Safe's filter at each limit: the share of episodes that cost at most so much, and their best return.

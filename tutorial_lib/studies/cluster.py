@@ -1,7 +1,7 @@
-"""Cells of a study on many processes: dask.distributed, on this machine or on a cluster.
+"""Entries of a study on many processes: dask.distributed, on this machine or on a cluster.
 
-A worker that dies takes nothing with it but the updates since its cell's last checkpoint: the scheduler
-hands the cell to another one, which goes on from there.
+A worker that dies takes nothing with it but the updates since its entry's last checkpoint: the scheduler
+hands the entry to another one, which goes on from there.
 """
 
 import contextlib
@@ -15,7 +15,7 @@ from distributed import Client, Future, LocalCluster, as_completed, get_worker
 from distributed.scheduler import KilledWorker
 from tqdm.auto import tqdm
 
-from tutorial_lib.studies.runs import Cell, results_path, run_cell
+from tutorial_lib.studies.runs import Runs, results_path, train_and_play
 
 TOPIC = "updates"
 ONE_THREAD = {f"{library}_NUM_THREADS": 1 for library in ("OMP", "MKL", "OPENBLAS")}
@@ -33,7 +33,7 @@ def connect(scheduler: str | None = None, workers: int | None = None) -> Iterato
     with contextlib.ExitStack() as stack:
         if scheduler is None:
             # No limit on memory: at its default, a share of the machine's, workers are killed where the cores
-            # are many, and a cell needs little.
+            # are many, and an entry needs little.
             options = {"threads_per_worker": 1, "memory_limit": None, "dashboard_address": None}
             options |= {"silence_logs": logging.CRITICAL}  # what matters is reported at the end
             stack.enter_context(dask.config.set({"distributed.nanny.pre-spawn-environ": ONE_THREAD}))
@@ -41,17 +41,18 @@ def connect(scheduler: str | None = None, workers: int | None = None) -> Iterato
         yield stack.enter_context(Client(scheduler))
 
 
-def run_cells(chosen: list[Cell], folder: Path, client: Client, progress: bool = True) -> dict[str, str]:
-    """Run the cells that are not finished. Returns what went wrong, by the names of the cells that failed.
+def run_all(chosen: list[Runs], folder: Path, client: Client, progress: bool = True) -> dict[str, str]:
+    """Run the entries that are not finished. Returns what went wrong, by the names of the entries that
+    failed.
 
-    Whatever happens to a cell, the others go on. Progress counts updates.
+    Whatever happens to an entry, the others go on. Progress counts updates.
     """
     folder = Path(folder).absolute()
-    waiting = {cell.name: cell for cell in chosen if not results_path(cell, folder).exists()}
-    total, made = sum(cell.config.steps for cell in waiting.values()), dict.fromkeys(waiting, 0)
+    waiting = {runs.name: runs for runs in chosen if not results_path(runs, folder).exists()}
+    total, made = sum(runs.config.updates for runs in waiting.values()), dict.fromkeys(waiting, 0)
     failures: dict[str, str] = {}
     with tqdm(total=total, unit="update", smoothing=0.05, disable=not progress, mininterval=1) as bar:
-        bar.set_description(f"{len(chosen) - len(waiting)} of {len(chosen)} cells done")
+        bar.set_description(f"{len(chosen) - len(waiting)} of {len(chosen)} entries done")
 
         def heard(event):
             _, (name, updates) = event
@@ -60,24 +61,24 @@ def run_cells(chosen: list[Cell], folder: Path, client: Client, progress: bool =
 
         client.subscribe_topic(TOPIC, heard)
         futures = [
-            client.submit(_run_on_worker, cell, folder, key=cell.name, pure=False)
-            for cell in waiting.values()
+            client.submit(_run_on_worker, runs, folder, key=runs.name, pure=False)
+            for runs in waiting.values()
         ]
         for done, future in enumerate(as_completed(futures), len(chosen) - len(waiting) + 1):
             if future.status != "finished":
                 failures[future.key] = _reason(future)
-            heard((None, (future.key, waiting[future.key].config.steps)))
+            heard((None, (future.key, waiting[future.key].config.updates)))
             lost = f", {len(failures)} failed" if failures else ""
-            bar.set_description(f"{done - len(failures)} of {len(chosen)} cells done{lost}")
+            bar.set_description(f"{done - len(failures)} of {len(chosen)} entries done{lost}")
         client.unsubscribe_topic(TOPIC)
     return failures
 
 
-def _run_on_worker(cell: Cell, folder: Path) -> None:
+def _run_on_worker(runs: Runs, folder: Path) -> None:
     worker = get_worker()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # they would run across the progress bar; metrics.csv has the numbers
-        run_cell(cell, folder, lambda updates: worker.log_event(TOPIC, (cell.name, updates)))
+        train_and_play(runs, folder, lambda updates: worker.log_event(TOPIC, (runs.name, updates)))
 
 
 def _reason(future: Future) -> str:

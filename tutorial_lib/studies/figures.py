@@ -4,6 +4,7 @@ A dot is a seed, a larger mark their mean. All draw from raw results; without ro
 """
 
 import functools
+import itertools
 
 import numpy as np
 import pandas as pd
@@ -232,7 +233,8 @@ def promises(results):
         part, names = means[means["task"] == task], get_task(task).cost_limit_names
         end = 1.1 * part[["predicted_cost", "cost", "threshold"]].to_numpy().max()
         ax.plot([0, end], [0, end], color=NEUTRAL, linewidth=1.5, label="paid as predicted")
-        for alpha, mark, (limit, name) in zip((0.35, 0.65, 1), "os^", names.items(), strict=True):
+        looks = zip(itertools.cycle((0.35, 0.65, 1)), itertools.cycle("os^DvPX"), strict=False)
+        for (alpha, mark), (limit, name) in zip(looks, names.items(), strict=False):
             rows = part[part["threshold"] == limit]
             style = {"color": COST, "alpha": alpha, "markersize": 9, "label": f"{name} limit"}
             ax.plot(rows["predicted_cost"], rows["cost"], mark, **style)
@@ -273,7 +275,7 @@ def study_figure(name: str, results):
 
 @one_figure
 def cost_return_plane(dataset, task: Task):
-    """Every episode of a dataset by its cost and its return, with the task's three thresholds."""
+    """Every episode of a dataset by its cost and its return, with the task's thresholds."""
     figure, ax = subplots(figsize=(9, 5))
     ax.plot(dataset.episode_costs, dataset.episode_returns, "o", color=NEUTRAL, markersize=4, alpha=0.5)
     ax.set(xlabel="cost of the episode", ylabel="return of the episode")

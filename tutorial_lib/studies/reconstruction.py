@@ -1,6 +1,6 @@
 """How large must the reconstruction model be, and what noise should it train on? A CSV of measured errors.
 
-`python -m tutorial_lib.reconstruction_study` makes data/results/reconstruction.csv in about half an hour.
+`python -m tutorial_lib.studies.reconstruction` makes data/results/reconstruction.csv in about half an hour.
 """
 
 import dataclasses
@@ -11,9 +11,9 @@ import numpy as np
 import pandas as pd
 import torch
 
-from tutorial_lib.config import Config, get_profile
 from tutorial_lib.costs.reconstruction import (
     CostReconstruction,
+    ReconstructionConfig,
     episode_sums,
     input_noise,
     random_sums,
@@ -33,11 +33,10 @@ STEPS = 2_000
 """Iterations of Algorithm 1 for every size, at a batch of 256."""
 
 
-def crm_config(size: str, noise: float, noise_rate: float = 0.0, steps: int = STEPS) -> Config:
+def crm_config(size: str, noise: float, noise_rate: float = 0.0, steps: int = STEPS) -> ReconstructionConfig:
     """The configuration of a model of this size, trained on this noise."""
     layers, width = SIZES[size]
-    return dataclasses.replace(
-        get_profile("small"),
+    return ReconstructionConfig.make("small").changed(
         crm="mlp" if layers else "linear",
         crm_layers=layers,
         crm_width=width,
@@ -48,7 +47,12 @@ def crm_config(size: str, noise: float, noise_rate: float = 0.0, steps: int = ST
 
 
 def errors(
-    model: CostReconstruction, task: Task, dataset: Dataset, config: Config, n: int = 20_000, seed: int = 1
+    model: CostReconstruction,
+    task: Task,
+    dataset: Dataset,
+    config: ReconstructionConfig,
+    n: int = 20_000,
+    seed: int = 1,
 ) -> dict[str, float]:
     """Root mean squared errors, in unsafe steps, where the inputs have the noise of `config`.
 

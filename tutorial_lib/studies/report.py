@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from tutorial_lib.config import get_profile
+from tutorial_lib.agents import C2IQL
 from tutorial_lib.costs.conditioning import threshold_set
 from tutorial_lib.data.recordings import best_left
 from tutorial_lib.data.sources import SHIPPED_DATA, load_dataset, shipped_tasks
@@ -60,7 +60,7 @@ def frontier() -> str:
     """The best return at a cost of at most so much, ours against DSRL's."""
     rows = []
     for name in shipped_tasks():
-        data, points = load_dataset(name), DSRL_FRONTIER[name]
+        data, points = load_dataset(name), DSRL_FRONTIER.get(name, {})
         for (cost, dsrl), ours in zip(points.items(), best_left(data, list(points))[1], strict=True):
             row = {"task": name, "cost at most": cost, "DSRL": dsrl, "ours": f"{ours:.0f}"}
             rows.append(row | {"ours / DSRL": f"{ours / dsrl:.2f}"})
@@ -85,25 +85,25 @@ def results_table(results: pd.DataFrame | None = None) -> str:
 
 
 def baselines_table() -> str:
-    """Our algorithms on all tasks, what was not run, and the paper's: mean reward / mean cost."""
+    """Our algorithms on the paper's tasks, what was not run, and the paper's: mean reward / mean cost."""
     results = load_results("table1")
     if not len(results):
         return f"*{not_run('table1').capitalize()}.*"
     found = over_seeds(results).set_index(["algorithm", "task"])
     run = found.index.get_level_values(0).unique()
     missing = [name for name in ("BC-All", "BC-Safe", *TABLE1) if name not in run]
-    rows = []
+    rows, tasks = [], [task for task in TASKS if task in TABLE1["C2IQL"]]
     for name in run:
         row = {"": name, "seeds": found.loc[name, "seeds"].min()}
-        for task in TASKS:
+        for task in tasks:
             key = (name, task)
             row[task] = _pair(*found.loc[key, list(SCORES)]) if key in found.index else "not run"
         rows.append(row)
     if missing:
-        rows.append({"": ", ".join(missing), "seeds": "-"} | dict.fromkeys(TASKS, "not run"))
+        rows.append({"": ", ".join(missing), "seeds": "-"} | dict.fromkeys(tasks, "not run"))
     for name in ("C2IQL", *(name for name in run if name in TABLE1 and name != "C2IQL")):
         row = {"": f"the paper's {name}, on DSRL's data", "seeds": 5}
-        rows.append(row | {task: _pair(*TABLE1[name][task]) for task in TASKS})
+        rows.append(row | {task: _pair(*TABLE1[name][task]) for task in tasks})
     return markdown(pd.DataFrame(rows))
 
 
@@ -144,7 +144,7 @@ def paper_profile_table() -> str:
         return "*Not run.*"
     same = small["task"].isin(paper["task"]) & (small["algorithm"] == "C2IQL")
     paper = paper.sort_values(["cost_critics", "updates"], kind="stable")
-    both = pd.concat([paper, small[same].assign(cost_critics=get_profile("small").cost_critics)])
+    both = pd.concat([paper, small[same].assign(cost_critics=C2IQL.configure("small").cost_critics)])
     words = both["profile"] + ", " + both["updates"].map("{:,} updates".format)
     table = markdown(study_table(both.assign(run=words)))
     return f"{table}\n\n![what the critics expect](results/paper-profile.png)"
@@ -156,7 +156,7 @@ def write_paper_profile() -> Path | None:
     if not len(log):
         return None
     task = get_task(load_results("paper-profile")["task"].iloc[0])
-    told = threshold_set(task, with_zero=get_profile("paper").zero_threshold)
+    told = threshold_set(task, with_zero=C2IQL.configure("paper").zero_threshold)
     figure = expected_costs(log, load_dataset(task.name).episode_costs.mean(), np.isinf(told).mean())
     return drawn(figure, RESULTS / "paper-profile.png")
 

@@ -1,8 +1,8 @@
-"""Bullet tasks behind gymnasium's API: truly seeded, with the cost in a field of its own.
+"""The tasks of the family "bullet" as gymnasium environments that are seeded and report the cost separately.
 
-The simulator, `bullet-safety-gym`, ignores `reset(seed=...)`: it draws from NumPy's global generator,
-and the motor commands and contacts of one episode act on the first instant of the next. Both are
-mended here, so a seed names an episode whatever ran before it.
+The simulator, `bullet-safety-gym`, ignores `reset(seed=...)`: it draws from NumPy's global generator, and
+the motor commands and contacts of one episode act on the first instant of the next. This module corrects
+both, so that a seed repeats an episode whatever ran before it.
 """
 
 import contextlib
@@ -12,7 +12,7 @@ import warnings
 import gymnasium
 import numpy as np
 
-from tutorial_lib.tasks.record import Task, get_task
+from tutorial_lib.tasks.record import Task
 
 
 class BulletTask(gymnasium.Env):
@@ -25,10 +25,10 @@ class BulletTask(gymnasium.Env):
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 15}
 
-    def __init__(self, task: Task | str, render_mode: str | None = None, image_size=(320, 240)):
+    def __init__(self, task: Task, render_mode: str | None = None, image_size=(320, 240)):
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode must be None or 'rgb_array', not {render_mode!r}")
-        self.task = get_task(task) if isinstance(task, str) else task
+        self.task = task
         self.render_mode = render_mode
         self.image_size = image_size
         with _global_numpy_seed(0):
@@ -83,7 +83,12 @@ class BulletTask(gymnasium.Env):
 
     @property
     def position(self) -> np.ndarray:
-        """The robot's (x, y) in metres: what the Run and Circle costs look at."""
+        """The robot's (x, y) in metres: what the Run and Circle costs look at.
+
+        Raises AttributeError where the task has no scene, so that the environment has no position.
+        """
+        if self.task.scene is None:
+            raise AttributeError(f"{self.task.name} has no scene, and so no position")
         return self._sim.agent.get_position()[:2]
 
     @property

@@ -9,39 +9,51 @@ from tutorial_lib.course import tabular
 from tutorial_lib.course.figures.episodes import _draw_path
 from tutorial_lib.playing import Rollout
 from tutorial_lib.style import COST, DASHED, LIMIT, NEUTRAL, REWARD, legend_below, one_figure, subplots
-from tutorial_lib.tasks import TASKS, Task, make_env
-
-ROBOTS = ("Ball", "Car", "Drone", "Ant")
+from tutorial_lib.tasks import TASKS, Task, make_env, scene_of
 
 # --- The tasks ---
 
 
 @one_figure
-def all_tasks(seed: int = 0, size=(320, 240)):
-    """Every task as its camera sees the start of an episode; a ring shows where the small robots are."""
-    figure, axes = subplots(2, 4, figsize=(12, 4.9))
-    for line, kind in zip(axes, ("Run", "Circle"), strict=True):
-        for ax, robot in zip(line, ROBOTS, strict=True):
-            env = make_env(TASKS[robot + kind], render_mode="rgb_array", image_size=size)
-            env.reset(seed=seed)
-            ax.imshow(env.render())
-            if kind == "Circle":
-                ax.add_patch(Circle(env.pixel, 20, fill=False, color="white", linewidth=2))
-            env.close()
-            ax.set(xticks=[], yticks=[], title=robot if kind == "Run" else None)
-            ax.spines[:].set_visible(False)
-        line[0].set_ylabel(kind, fontsize=15)
+def all_tasks(seed: int = 0, size=(320, 240), family: str = "bullet"):
+    """The tasks of a family, as the camera sees the start of an episode, by scene and by robot.
+
+    A ring shows where a robot is that is seen from afar. Tasks without a scene are left out. Raises
+    ValueError where no task is left.
+    """
+    shown = [task for task in TASKS.values() if task.family == family and task.scene is not None]
+    if not shown:
+        raise ValueError(f"no task of the family {family!r} has a scene")
+    tasks = {(task.scene, task.robot): task for task in shown}
+    scenes, robots = (list(dict.fromkeys(part)) for part in zip(*tasks, strict=True))
+    shape, figsize = (len(scenes), len(robots)), (3 * len(robots), 2.45 * len(scenes))
+    figure, axes = subplots(*shape, figsize=figsize, squeeze=False)
+    for ax in axes.flat:
+        ax.set(xticks=[], yticks=[])
+        ax.spines[:].set_visible(False)
+    for (scene, robot), task in tasks.items():
+        ax = axes[scenes.index(scene), robots.index(robot)]
+        env = make_env(task, render_mode="rgb_array", image_size=size)
+        env.reset(seed=seed)
+        ax.imshow(env.render())
+        if scene.is_seen_from_afar:
+            ax.add_patch(Circle(env.pixel, 20, fill=False, color="white", linewidth=2))
+        env.close()
+    for ax, robot in zip(axes[0], robots, strict=True):
+        ax.set_title(robot)
+    for ax, scene in zip(axes[:, 0], scenes, strict=True):
+        ax.set_ylabel(scene.name, fontsize=15)
     return figure
 
 
 @one_figure
 def drives(task: Task, episodes: dict):
-    """Whole episodes from above, with the cost zone, side by side (Run: one above the other), by title.
+    """Whole episodes from above, with the cost zone, by title, in panels as the task's scene suggests.
 
     Each has rewards (T,), costs (T,) and positions (T, 2).
     """
-    count, run = len(episodes), "Run" in task.name
-    shape, size = ((count, 1), (12, 2.5 * count)) if run else ((1, count), (4 * count, 4.9))
+    scene = scene_of(task)
+    shape, size = scene.layout(len(episodes))
     figure, axes = subplots(*shape, figsize=size, sharex=True, sharey=True, squeeze=False)
     for ax, (title, drive) in zip(axes.flat, episodes.items(), strict=True):
         zeros, length = np.zeros(len(drive.costs)), np.array([len(drive.costs)])
@@ -49,7 +61,7 @@ def drives(task: Task, episodes: dict):
                       length, zeros[:1])  # fmt: skip
         _draw_path(ax, one, 0, task)
         summary = f"cost {np.sum(drive.costs):.0f}, return {np.sum(drive.rewards):.0f}"
-        ax.set_title(f"{title}: {summary}" if run else f"{title}\n{summary}")  # a Circle's panel is narrow
+        ax.set_title(f"{title}: {summary}" if scene.is_wide else f"{title}\n{summary}")
         ax.label_outer()
     legend_below(figure, *axes.flat)
     return figure

@@ -4,22 +4,18 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from tutorial_lib.costs.conditioning import INFINITE_CODE, rescaled_budget
-from tutorial_lib.playing import Rollout, condition, rollout
+from tutorial_lib.playing import Rollout, rollout
 from tutorial_lib.style import (
     COST,
     DASHED,
     LIMIT,
     NEUTRAL,
-    REWARD,
     Picture,
     legend_below,
     one_figure,
     subplots,
 )
-from tutorial_lib.tasks import Task, make_env
-
-WALL_X, CIRCLE_RADIUS = 6.0, 7.0  # Circle tasks: unsafe where |x| > 6; the reward is highest on the circle
-WALL_Y = 2.0  # Run tasks: unsafe where |y| > 2, and above a speed limit
+from tutorial_lib.tasks import Task, make_env, scene_of
 
 # --- The robot ---
 
@@ -31,14 +27,15 @@ def film(agent, limit: float, seed: int, steps, image_size=(360, 270), run: int 
     height, width, 3) and costs (frames,).
     """
     env = make_env(agent.task, render_mode="rgb_array", image_size=image_size)
+    player = agent.player([limit], [seed], run)
     observation, _ = env.reset(seed=seed)
     frames, costs, spent = [], [], 0.0
     for t in range(max(steps) + 1):
         if t in steps:
             frames.append(env.render())
             costs.append(spent)
-        limits = condition(agent, np.array([limit]), np.array([spent]), t) if agent.conditioned else [limit]
-        observation, _, terminated, _, info = env.step(agent.act(observation[None], limits, run)[0])
+        observation, reward, terminated, _, info = env.step(player.act(observation[None])[0])
+        player.see(np.array([reward]), np.array([info["cost"]]))
         spent += info["cost"]
         if terminated:
             break
@@ -58,7 +55,7 @@ def multiple_exposure(frames: np.ndarray) -> np.ndarray:
 
 @one_figure
 def robot_at_limits(agent, limits=None, seed: int = 10):
-    """The same start under each limit (default: the task's three): the robot at several steps at once."""
+    """The same start under each limit (default: the task's own): the robot at several steps at once."""
     task = agent.task
     limits = task.thresholds if limits is None else limits
     steps = range(task.horizon // 3, task.horizon // 3 + 36, 3)  # a Ball's or a Car's lap, about
@@ -92,9 +89,7 @@ def frames_strip(frames, costs, steps, limit: float):
 @one_figure
 def paths(played: Rollout, task: Task, limits):
     """Each episode of a rollout from above: where the robot was, where that was unsafe, the cost zone."""
-    count = len(limits)
-    run = "Run" in task.name
-    shape, size = ((count, 1), (11, 2.6 * count)) if run else ((1, count), (4 * count, 4.9))
+    shape, size = scene_of(task).layout(len(limits), wide_panel=(11, 2.6))
     figure, axes = subplots(*shape, figsize=size, sharex=True, sharey=True, squeeze=False)
     for e, (ax, limit) in enumerate(zip(axes.flat, limits, strict=True)):
         _draw_path(ax, played, e, task)
@@ -148,31 +143,15 @@ def _summary(played: Rollout, e: int, words: str) -> str:
 
 
 def _draw_path(ax, played: Rollout, e: int, task: Task):
-    x, y = played.positions[: played.lengths[e], e].T
+    scene, positions = scene_of(task), played.positions[: played.lengths[e], e]
+    x, y = positions.T
     unsafe = played.costs[: played.lengths[e], e] > 0
-    if "Run" in task.name:
-        outside = np.abs(y) > WALL_Y
-        height = max(3.0, 1.1 * np.abs(y).max(), ax.get_ylim()[1])  # panels share their axes
-        for side in (-1, 1):
-            ax.axhspan(side * WALL_Y, side * 1000, color=COST, alpha=0.15, linewidth=0)
-        ax.set(ylim=(-height, height), yticks=(-WALL_Y, 0, WALL_Y))
-    else:
-        outside = np.abs(x) > WALL_X
-        width = max(9.0, 1.1 * np.abs([x, y]).max(), ax.get_xlim()[1])
-        for side in (-1, 1):
-            ax.axvspan(side * WALL_X, side * 1000, color=COST, alpha=0.15, linewidth=0)
-        angle = np.linspace(0, 2 * np.pi, 200)
-        circle = CIRCLE_RADIUS * np.cos(angle), CIRCLE_RADIUS * np.sin(angle)
-        ax.plot(*circle, color=REWARD, linewidth=1.5, alpha=0.6, label="where the reward is highest")
-        ticks = (-WALL_X, 0, WALL_X)
-        ax.set(xlim=(-width, width), ylim=(-width, width), xticks=ticks, yticks=ticks, aspect="equal")
+    scene.draw(ax, positions)
     ax.plot(x, y, color=NEUTRAL, linewidth=1.5, label="the robot's way", zorder=2)
     ax.plot(x[0], y[0], "o", color=LIMIT, markersize=8, label="start", zorder=4)
-    for where, marker, words in ((outside, "o", "unsafe: outside"), (~outside, "^", "unsafe: too fast")):
-        if where is outside or "Run" in task.name:
-            here = unsafe & where
-            ax.plot(x[here], y[here], marker, color=COST, markersize=6, label=words, zorder=3)
-    ax.set(xlabel="x (m)", ylabel="y (m)")
+    for marker, (reason, where) in zip("o^sDv", scene.reasons(positions).items(), strict=False):
+        here = unsafe & where
+        ax.plot(x[here], y[here], marker, color=COST, markersize=6, label=f"unsafe: {reason}", zorder=3)
 
 
 def _draw_cost_so_far(ax, played: Rollout, e: int, limit: float):
@@ -188,9 +167,9 @@ def _draw_condition(ax, played: Rollout, e: int, limit: float, task: Task):
     wish = [rescaled_budget(limit, spent[t], t, task.horizon) for t in steps]
     top = INFINITE_CODE * task.cost_range
     ax.plot(steps, np.clip(wish, 0, top), color=NEUTRAL, linewidth=1.5, label="eq. 23: budget left, rescaled")
-    given = np.where(np.isinf(played.conditions[steps, e]), top, played.conditions[steps, e])
+    given = np.where(np.isinf(played.told[steps, e]), top, played.told[steps, e])
     ax.step(steps, given, where="post", color=LIMIT, label="threshold given")
-    infinite = np.isinf(played.conditions[steps, e]).any()
+    infinite = np.isinf(played.told[steps, e]).any()
     finite = sorted({*task.thresholds, *given[given < top]})
     ticks = [*finite, *([top] if infinite else [])]
     ax.set_yticks(ticks, [*map("{:g}".format, finite), *(["∞"] if infinite else [])])

@@ -104,17 +104,18 @@ def room_left(results):
     for ax, name in zip(axes.flat, tasks, strict=False):
         task, data = get_task(name), load_dataset(name)
         best = normalised_return(best_left(data, task.thresholds)[1], task)
-        ax.plot(range(3), best, "_", color=LIMIT, markersize=40, markeredgewidth=3, label="best recorded")
+        places = range(len(task.thresholds))
+        ax.plot(places, best, "_", color=LIMIT, markersize=40, markeredgewidth=3, label="best recorded")
         for algorithm in ("C2IQL", "BC-Safe"):
             part = scored[(scored["task"] == name) & (scored["algorithm"] == algorithm)]
             means = part.groupby("threshold")[list(SCORES)].mean().reindex(task.thresholds)
             if means.notna().any(axis=None):
                 look, rewards = looks[algorithm] | {"linewidth": 1.5}, means["reward_score"].to_numpy()
-                ax.plot(range(3), rewards, **look, label=algorithm)
+                ax.plot(places, rewards, **look, label=algorithm)
                 unsafe = np.flatnonzero(means["cost_score"] > 1)
                 ax.plot(unsafe, rewards[unsafe], **look | {"linestyle": "", "markerfacecolor": "white"})
-        ax.set_xticks(range(3), [f"{limit:g}" for limit in task.thresholds])
-        ax.set(xlabel="limit", xlim=(-0.5, 2.5))
+        ax.set_xticks(places, [f"{limit:g}" for limit in task.thresholds])
+        ax.set(xlabel="limit", xlim=(-0.5, len(places) - 0.5))
     axes[0, 0].set_ylim(0, None)
     for ax in axes[:, 0]:
         ax.set_ylabel("normalised return")

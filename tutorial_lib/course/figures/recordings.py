@@ -3,8 +3,7 @@
 import numpy as np
 from matplotlib.colors import LogNorm
 
-from tutorial_lib.course.figures.episodes import WALL_X, WALL_Y
-from tutorial_lib.data.recordings import best_left, best_mixture, near_best, positions
+from tutorial_lib.data.recordings import best_left, best_mixture, near_best
 from tutorial_lib.style import (
     COST,
     DASHED,
@@ -16,7 +15,7 @@ from tutorial_lib.style import (
     subplots,
     task_panels,
 )
-from tutorial_lib.tasks import DSRL_FRONTIER, Task, get_task
+from tutorial_lib.tasks import DSRL_FRONTIER, Task, get_task, scene_of
 
 DOTS = {"marker": "o", "linestyle": "none", "markersize": 3, "alpha": 0.4, "markeredgewidth": 0}
 
@@ -25,7 +24,8 @@ DOTS = {"marker": "o", "linestyle": "none", "markersize": 3, "alpha": 0.4, "mark
 def planes(datasets: dict, frontier: bool = False):
     """Every episode of every dataset {task name: Dataset} by cost and return, thresholds dashed.
 
-    `frontier` adds the best return left under each limit, the best mixture of episodes, and DSRL's frontier.
+    `frontier` adds the best return left under each limit, the best mixture of episodes, and DSRL's frontier
+    where it was read.
     """
     figure, axes = task_panels(datasets, 3.6)
     for ax, (name, data) in zip(axes.flat, datasets.items(), strict=False):
@@ -39,7 +39,8 @@ def planes(datasets: dict, frontier: bool = False):
             mix = {"color": REWARD, "linewidth": 1.5, "linestyle": ":"}
             ax.plot(limits, best_mixture(data, limits), label="best mixture", **mix)
             mark = {"color": COST, "markersize": 9, "label": "DSRL's frontier, read off its plots"}
-            ax.plot(*zip(*DSRL_FRONTIER[name].items(), strict=True), "D", **mark)
+            if name in DSRL_FRONTIER:
+                ax.plot(*zip(*DSRL_FRONTIER[name].items(), strict=True), "D", **mark)
         ax.set(xlabel="cost", xticks=[0, *task.thresholds])
     for ax in axes[:, 0]:
         ax.set_ylabel("return")
@@ -80,19 +81,12 @@ def visited(datasets: dict):
     """Where the robot was after each recorded step, as steps per bin; lines mark the cost zones."""
     figure, axes = task_panels(datasets, 3.5)
     for ax, (name, data) in zip(axes.flat, datasets.items(), strict=False):
-        x, y = positions(data).T
-        run = "Run" in name
+        scene = scene_of(get_task(name))
+        x, y = scene.positions(data.next_observations).T
         bins = [np.linspace(x.min(), x.max(), 61), np.linspace(y.min(), y.max(), 61)]
         *_, picture = ax.hist2d(x, y, bins, norm=LogNorm(1, 3000), cmap="Blues")
-        line = ax.axhline if run else ax.axvline
-        for side in (-1, 1):
-            line(side * (WALL_Y if run else WALL_X), color=COST, linewidth=2, label="edge of the cost zone")
+        scene.draw_walls(ax)
         ax.set(xlabel="x (m)", facecolor="white")
-        if run:
-            low = min(-1.15 * WALL_Y, y.min())
-            ax.set_ylim(low, max(1.15 * WALL_Y, y.max()))
-        else:
-            ax.set_aspect("equal")
     for ax in axes[:, 0]:
         ax.set_ylabel("y (m)")
     figure.colorbar(picture, ax=axes, label="steps per bin", shrink=0.8)
@@ -106,12 +100,13 @@ def examples_left(datasets: dict, share: float = 0.9):
     figure, axes = task_panels(datasets, 3.4)
     for ax, (name, data) in zip(axes.flat, datasets.items(), strict=False):
         thresholds = get_task(name).thresholds
+        places = range(len(thresholds))
         left = [np.sum(data.episode_costs <= limit) for limit in thresholds]
         good = [near_best(data, limit, share) for limit in thresholds]
-        ax.bar(range(3), left, color=NEUTRAL, alpha=0.4, label="keep the limit")
+        ax.bar(places, left, color=NEUTRAL, alpha=0.4, label="keep the limit")
         words = f"and earn at least {share:.0%} of the best that do"
-        ax.bar_label(ax.bar(range(3), good, color=REWARD, label=words), fontsize=13)
-        ax.set_xticks(range(3), [f"{limit:g}" for limit in thresholds])
+        ax.bar_label(ax.bar(places, good, color=REWARD, label=words), fontsize=13)
+        ax.set_xticks(places, [f"{limit:g}" for limit in thresholds])
         ax.set_xlabel("limit")
     for ax in axes[:, 0]:
         ax.set_ylabel("episodes")
