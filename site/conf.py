@@ -12,6 +12,7 @@ from markdown_it import MarkdownIt
 import tutorial_lib
 
 sys.path.insert(0, str(Path(__file__).parent))
+import algorithms  # noqa: E402
 from marks import remove_marks  # noqa: E402
 
 project = "Safe offline reinforcement learning with C2IQL"
@@ -46,6 +47,7 @@ def setup(app):
 def write_reference_pages(app):
     """One page per module, in the order of the alphabet: a new module needs no line here."""
     modules = pkgutil.walk_packages(tutorial_lib.__path__, "tutorial_lib.")
+    algorithms.write(Path(app.srcdir))
     names = sorted(module.name for module in modules if not module.name.endswith("__main__"))
     folder = Path(app.srcdir, "reference")
     folder.mkdir(exist_ok=True)

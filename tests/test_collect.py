@@ -34,9 +34,16 @@ from tutorial_lib.tasks.recipes import RECIPES, Recipe
 
 ROOT = Path(__file__).parents[1]
 BALL = TASKS["BallRun"]  # T = 100, cost range 80
-BATCH = 2048  # an episode of 100 steps in each of the 16 environments, and a part of the next
+BATCH = 1616  # an episode of 100 steps in each of the 16 environments, and one step of the next
 SLICE = 2 * BATCH  # the multiplier looks at the episodes of the first batch
-RECIPE = Recipe(episodes=20, steps=2 * SLICE, batch_steps=BATCH, limit_falls=(0.0, 0.01))
+RECIPE = Recipe(
+    episodes=20,
+    steps=2 * SLICE,
+    batch_steps=BATCH,
+    ramp=(0.25, 0.75),
+    learning_rate=(1e-3, 2e-4),
+    limit_falls=(0.0, 0.01),
+)
 
 
 # --- Thinning ---
@@ -322,120 +329,129 @@ def test_the_multiplier_is_that_of_a_slow_loop(task, seed):
     assert min(prices) == min(integrals) == 0 and max(integrals) == 0.8  # all that is cut off was cut off
 
 
-def noted(monkeypatch):
-    """Notes of every model that `run_ppo` makes: (scales, learning rates, state before and after a slice)."""
-    scales, rates, states, make = [], [], [], ppo.make_ppo
+def test_without_a_ramp_prices_are_full_from_the_first_step():
+    assert at(Schedule(BALL, replace(RECIPE, ramp=None), "priced", []), 0) == 1
+
+
+# --- A run of two slices ---
+
+
+def note(monkeypatch):
+    """What `run_ppo` does from here on: price scales and learning rates of the batches, states of the slices."""
+    notes, make = SimpleNamespace(scales=[], rates=[], starts=[], ends=[]), ppo.make_ppo
 
     def state(model, schedule):
         weights = {key: value.numpy().copy() for key, value in model.policy.state_dict().items()}
-        rms = {"mean": model.env.obs_rms.mean.copy(), "var": np.array(model.env.ret_rms.var)}
-        return weights | rms | {"multiplier": np.array(schedule.multiplier.value)}
+        moments = {"mean": model.env.obs_rms.mean.copy(), "var": np.array(model.env.ret_rms.var)}
+        return weights | moments | {"multiplier": np.array(schedule.multiplier.value)}
 
-    def noting(*arguments):
+    def make_and_note(*arguments):
         model, schedule = make(*arguments)
         train, learn = model.train, model.learn
 
         def train_and_note():
             train()
-            scales.append(model.env.get_attr("price_scale")[0])
-            rates.append(model.policy.optimizer.param_groups[0]["lr"])
+            notes.scales.append(model.env.get_attr("price_scale")[0])
+            notes.rates.append(model.policy.optimizer.param_groups[0]["lr"])
 
         def learn_and_note(steps, callback):
-            states.append(state(model, schedule))
+            notes.starts.append(state(model, schedule))
             learn(steps, callback)
-            states.append(state(model, schedule))
+            notes.ends.append(state(model, schedule))
 
         model.train, model.learn = train_and_note, learn_and_note
         return model, schedule
 
-    monkeypatch.setattr(ppo, "make_ppo", noting)
-    return scales, rates, states
+    monkeypatch.setattr(ppo, "make_ppo", make_and_note)
+    return notes
 
 
-def assert_continued(states):
-    """Every slice begins with the weights, the normalisation and the multiplier that the one before it left."""
-    assert len(states) > 2
-    for end, start in zip(states[1:-1:2], states[2::2], strict=True):
-        for key, value in end.items():
-            np.testing.assert_array_equal(value, start[key], err_msg=key)
-    assert any((states[0][key] != states[1][key]).any() for key in states[0])
+@pytest.fixture(scope="module")
+def uninterrupted(tmp_path_factory):
+    """The folder of a run of each kind that nothing interrupted, and notes of each."""
+    folder, notes = tmp_path_factory.mktemp("uninterrupted"), {}
+    for kind in KINDS:
+        with pytest.MonkeyPatch.context() as monkeypatch:
+            notes[kind] = note(monkeypatch)
+            run_ppo(BALL, RECIPE, kind, 0, folder / "BallRun" / f"{kind}-0", slice_steps=SLICE)
+    return SimpleNamespace(folder=folder, notes=notes)
 
 
-def test_prices_rise_and_the_learning_rate_falls_along_a_run(tmp_path, monkeypatch):
-    scales, rates, states = noted(monkeypatch)
-    recipe = replace(RECIPE, ramp=(0.25, 0.75), learning_rate=(1e-3, 2e-4), steps=4 * BATCH)
-    run_ppo(BALL, recipe, "priced", 0, tmp_path, slice_steps=BATCH)
-    assert scales == pytest.approx([0, 0, 0.5, 1]) and rates == pytest.approx([1e-3, 8e-4, 6e-4, 4e-4])
-    assert_continued(states)
+def test_prices_rise_and_the_learning_rate_falls_along_a_run(uninterrupted):
+    assert uninterrupted.notes["priced"].scales == pytest.approx([0, 0, 0.5, 1])
+    for kind in KINDS:
+        assert uninterrupted.notes[kind].rates == pytest.approx([1e-3, 8e-4, 6e-4, 4e-4])
 
 
-def test_without_a_ramp_prices_are_full_from_the_first_step():
-    assert at(Schedule(BALL, replace(RECIPE, ramp=None), "priced", []), 0) == 1
+def test_the_multiplier_looks_at_the_episodes_of_the_batch_before(uninterrupted):
+    scales = uninterrupted.notes["lagrangian"].scales
+    first, second = (
+        load_file(path)["costs"].reshape(-1, 100).sum(axis=1)[:16].mean() / 80  # of its first batch
+        for path in sorted(uninterrupted.folder.glob("BallRun/lagrangian-0/episodes-*"))
+    )
+    assert first > 0  # and the limit is 0 when the multiplier first looks
+    assert scales == pytest.approx([0, 2.2 * first, 2.2 * first, 0.2 * (first + second) + 2 * second])
 
 
-def test_the_multiplier_goes_on_from_slice_to_slice(tmp_path, monkeypatch):
-    scales, _, states = noted(monkeypatch)
-    run_ppo(BALL, RECIPE, "lagrangian", 0, tmp_path, slice_steps=SLICE)
-    assert scales[0] == 0 < scales[1] == scales[2] != scales[3]  # two batches in a slice
-    episodes = load_file(tmp_path / "episodes-000.safetensors")
-    costs = episodes["costs"].reshape(-1, 100).sum(axis=1)[:16]  # those that the first batch ended
-    assert scales[1] == pytest.approx(2.2 * costs.mean() / 80)  # the limit is zero by then
-    assert_continued(states)
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_slice_begins_with_what_the_one_before_it_left(kind, uninterrupted):
+    notes = uninterrupted.notes[kind]
+    assert len(notes.starts) == len(notes.ends) == 2
+    for key, value in notes.ends[0].items():
+        np.testing.assert_array_equal(value, notes.starts[1][key], err_msg=key)
+        if kind == "lagrangian" or key != "multiplier":
+            assert (value != notes.starts[0][key]).any()
 
 
 # --- Killed and resumed ---
 
 
-@pytest.fixture(scope="module")
-def uninterrupted(tmp_path_factory):
-    """The folder of a run of each kind that nothing interrupted."""
-    folder = tmp_path_factory.mktemp("uninterrupted")
-    for kind in KINDS:
-        run_ppo(BALL, RECIPE, kind, 0, folder / "BallRun" / f"{kind}-0", slice_steps=SLICE)
-    return folder
-
-
 def run_and_die(when, kind, folder):
-    """What the killed process does: the first slice, and a part of the second."""
+    """What the killed process does: slices, until it has begun the second one or has not written its episodes."""
     save, step, steps = ppo.save_arrays, RecordedTask.step, []
 
-    def killed_before_the_episodes(arrays, path, *rest):
+    def save_or_die(arrays, path, *rest):
         if path.name == "episodes-001.safetensors":
             os.kill(os.getpid(), signal.SIGKILL)
         save(arrays, path, *rest)
 
-    def killed_in_the_middle(self, action):
+    def step_or_die(self, action):
         steps.append(1)
-        if len(steps) == SLICE + SLICE // 2:
+        if len(steps) == SLICE + BATCH + 1:  # one update of PPO is lost
             os.kill(os.getpid(), signal.SIGKILL)
         return step(self, action)
 
     if when == "between the two files":
-        ppo.save_arrays = killed_before_the_episodes
+        ppo.save_arrays = save_or_die
     else:
-        RecordedTask.step = killed_in_the_middle
+        RecordedTask.step = step_or_die
     run_ppo(BALL, RECIPE, kind, 0, folder, slice_steps=SLICE)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("when", ["between the two files", "in the middle"])
-def test_a_killed_run_continues_to_the_bytes_of_one_that_was_not(when, kind, uninterrupted, tmp_path):
-    command, env = [sys.executable, __file__, when, kind, tmp_path], os.environ | {"PYTHONPATH": str(ROOT)}
+def killed(when, kind, folder):
+    """The names of the files that a run has after it was started, or started again, and killed."""
+    command, env = [sys.executable, __file__, when, kind, folder], os.environ | {"PYTHONPATH": str(ROOT)}
     child = subprocess.run(command, env=env, capture_output=True, text=True)
     assert child.returncode == -signal.SIGKILL, child.stderr
-    there = {"episodes-000.safetensors", "state-001.safetensors"}
-    if when == "between the two files":
-        there.add("state-002.safetensors")
-    assert {path.name for path in tmp_path.iterdir()} == there
+    return sorted(path.name for path in folder.iterdir())
 
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_run_that_is_killed_twice_continues_to_the_bytes_of_one_that_was_not(kind, uninterrupted, tmp_path):
+    left = ["episodes-000.safetensors", "state-001.safetensors"]
+    assert killed("in the second slice", kind, tmp_path) == left
+    first = (tmp_path / left[0]).read_bytes()
+    assert killed("between the two files", kind, tmp_path) == [*left, "state-002.safetensors"]
+    assert (tmp_path / left[0]).read_bytes() == first  # it is not played again
     run_ppo(BALL, RECIPE, kind, 0, tmp_path, slice_steps=SLICE)
-    expected = uninterrupted / "BallRun" / f"{kind}-0"
+
+    whole = uninterrupted.folder / "BallRun" / f"{kind}-0"
     names = ["episodes-000.safetensors", "episodes-001.safetensors", "state-002.safetensors"]
-    assert sorted(path.name for path in tmp_path.iterdir()) == names  # nothing half-written, and no pickle
-    assert sorted(path.name for path in expected.iterdir()) == names
+    for folder in (tmp_path, whole):  # nothing half-written, and no pickle
+        assert sorted(path.name for path in folder.iterdir()) == names
     for name in names[:2]:
-        assert (tmp_path / name).read_bytes() == (expected / name).read_bytes()
-    ours, theirs = (load_file(folder / names[2]) for folder in (tmp_path, expected))
+        assert (tmp_path / name).read_bytes() == (whole / name).read_bytes()
+    ours, theirs = (load_file(folder / names[2]) for folder in (tmp_path, whole))
     assert ours.keys() == theirs.keys()
     for key in ours.keys() - {"seconds"}:
         np.testing.assert_array_equal(ours[key], theirs[key], err_msg=key)
@@ -443,30 +459,30 @@ def test_a_killed_run_continues_to_the_bytes_of_one_that_was_not(when, kind, uni
 
 
 def test_the_slices_and_the_kinds_play_other_episodes(uninterrupted):
-    slices = [load_file(path) for path in sorted(uninterrupted.glob("BallRun/*/episodes-*"))]
+    slices = [load_file(path) for path in sorted(uninterrupted.folder.glob("BallRun/*/episodes-*"))]
     assert [len(arrays["rewards"]) for arrays in slices] == [3_200] * 4
     starts = np.concatenate([arrays["observations"][::100] for arrays in slices])
     assert len(np.unique(starts, axis=0)) == 128
 
 
 def test_a_state_names_its_recipe_without_what_only_thinning_reads(uninterrupted):
-    with safe_open(uninterrupted / "BallRun" / "priced-0" / "state-002.safetensors", "np") as file:
+    with safe_open(uninterrupted.folder / "BallRun" / "priced-0" / "state-002.safetensors", "np") as file:
         metadata = file.metadata()
     played = {
-        "steps": 8192,
+        "steps": 6464,
         "prices": [0.02, 4.0],
         "allowance_share": 0.5,
         "allowances": [0.0, 1.0],
-        "ramp": [0.15, 0.5],
-        "learning_rate": [0.001, 0.0003],
+        "ramp": [0.25, 0.75],
+        "learning_rate": [0.001, 0.0002],
         "calm": None,
         "target_kl": None,
-        "batch_steps": 2048,
+        "batch_steps": 1616,
         "width": 64,
         "limit_falls": [0.0, 0.01],
         "own_axes": False,
     }
-    assert metadata == {"recipe": json.dumps(played), "slice_steps": "4096"}
+    assert metadata == {"recipe": json.dumps(played), "slice_steps": "3232"}
 
 
 @pytest.mark.parametrize("kind", ["", "Priced", "priced-0"])
@@ -482,14 +498,14 @@ def test_a_run_of_an_unknown_kind_is_refused(kind, tmp_path):
 def test_collected_episodes_become_a_dataset(uninterrupted, tmp_path, monkeypatch):
     monkeypatch.setattr(collecting, "run_ppo", functools.partial(run_ppo, slice_steps=SLICE))
     monkeypatch.setattr(ppo, "make_ppo", None)  # all episodes are there: nothing is run again
-    out = tmp_path / "data.hdf5"
-    made = collecting.collect(BALL, SOURCES, RECIPE, uninterrupted, out, workers=1)
+    folder, out = uninterrupted.folder, tmp_path / "data.hdf5"
+    made = collecting.collect(BALL, SOURCES, RECIPE, folder, out, workers=1)
     data = read_dataset(out, BALL)
     assert made.checksum == data.checksum and made.attributes == data.attributes
     attributes = data.attributes
     assert attributes["task"] == "BallRun" and attributes["made_by"] == "c2iql collect BallRun"
     assert attributes["collected_episodes"] == 128 and attributes["recipe"] == str(asdict(RECIPE))
-    states = [load_file(uninterrupted / "BallRun" / s / "state-002.safetensors") for s in SOURCES]
+    states = [load_file(folder / "BallRun" / s / "state-002.safetensors") for s in SOURCES]
     assert attributes["wall_seconds"] == round(sum(float(state["seconds"]) for state in states)) > 0
     assert "CC BY" in attributes["licence"] and "seeds" not in attributes
     for package in ("stable-baselines3", "pybullet", "bullet-safety-gym", "torch"):
@@ -505,7 +521,7 @@ def test_collected_episodes_become_a_dataset(uninterrupted, tmp_path, monkeypatc
     # Each episode is one of its source's, counted in the files.
     starts_of = {
         source: np.concatenate([load_file(p)["observations"][::100] for p in sorted(run.glob("episodes-*"))])
-        for source, run in ((source, uninterrupted / "BallRun" / source) for source in SOURCES)
+        for source, run in ((source, folder / "BallRun" / source) for source in SOURCES)
     }
     found = [
         (source, int(np.flatnonzero((starts == row).all(axis=1))[0]))
@@ -518,14 +534,14 @@ def test_collected_episodes_become_a_dataset(uninterrupted, tmp_path, monkeypatc
     counts = Counter(source for source, _ in found)
     assert json.loads(attributes["episodes_by_source"]) == counts and len(counts) == 2
 
-    collecting.collect(BALL, SOURCES, RECIPE, uninterrupted, tmp_path / "again.hdf5", workers=1)
+    collecting.collect(BALL, SOURCES, RECIPE, folder, tmp_path / "again.hdf5", workers=1)
     assert (tmp_path / "again.hdf5").read_bytes() == out.read_bytes()
-    run = uninterrupted / "BallRun" / "priced-0"
+    run = folder / "BallRun" / "priced-0"
     for change in ({"prices": (5.0, 50.0)}, {"limit_falls": (0.0, 0.5)}, {"width": 65}):
         with pytest.raises(ValueError, match=f"^{run}: was begun with another recipe"):
-            collecting.collect(BALL, SOURCES, replace(RECIPE, **change), uninterrupted, out, workers=1)
+            collecting.collect(BALL, SOURCES, replace(RECIPE, **change), folder, out, workers=1)
     fewer = replace(RECIPE, episodes=5, return_bins=1)  # only thinned in another way
-    assert collecting.collect(BALL, SOURCES, fewer, uninterrupted, out, workers=1).num_episodes < 20
+    assert collecting.collect(BALL, SOURCES, fewer, folder, out, workers=1).num_episodes < 20
 
 
 def write_run(folder, slices, first_tag):
@@ -645,7 +661,7 @@ def test_target_kl_stops_the_epochs_early():
         model.learn(BATCH, callback=schedule)
         return {int(moments["step"]) for moments in model.policy.optimizer.state_dict()["state"].values()}
 
-    assert steps(None) == {10 * BATCH // 512}
+    assert steps(None) == {10 * math.ceil(BATCH / 512)}
     (stopped,) = steps(1e-9)
     assert stopped <= 2
 

@@ -12,7 +12,6 @@ from PIL import Image
 
 from tutorial_lib import style
 from tutorial_lib.agents import C2IQL
-from tutorial_lib.config import get_profile
 from tutorial_lib.course import figures
 from tutorial_lib.data.dataset import Dataset
 from tutorial_lib.playing import Rollout
@@ -29,8 +28,7 @@ def without_a_screen():
 @pytest.fixture(scope="module")
 def agent():
     """Untrained: these tests look at pictures, not at skill."""
-    config = dataclasses.replace(get_profile("small"), hidden_width=8, crm_width=8, crm_layers=1)
-    return C2IQL(get_task("BallCircle"), config)
+    return C2IQL(get_task("BallCircle"), C2IQL.configure(hidden_width=8, crm_width=8, crm_layers=1))
 
 
 def played(task_name="BallCircle", episodes=3, cost_from=100):
@@ -38,7 +36,7 @@ def played(task_name="BallCircle", episodes=3, cost_from=100):
     task = get_task(task_name)
     time = np.linspace(0, 1, task.horizon)
     angle = 2 * np.pi * time
-    way = (np.stack([20 * time, 4 * time], 1) if "Run" in task_name
+    way = (np.stack([20 * time, 4 * time], 1) if task.scene.is_wide
            else 8 * np.stack([np.cos(angle), np.sin(angle)], 1))  # fmt: skip
     shape = (task.horizon, episodes)
     costs = np.zeros(shape)
@@ -90,7 +88,7 @@ def test_paths_has_a_panel_per_episode_and_marks_the_unsafe_steps():
     for ax in figure.axes:
         assert "cost 50, return 200" in ax.get_title()
         unsafe = labelled(ax, "unsafe: outside").get_xydata()
-        assert 0 < len(unsafe) < 50 and np.all(np.abs(unsafe[:, 0]) > figures.WALL_X)
+        assert 0 < len(unsafe) < 50 and np.all(np.abs(unsafe[:, 0]) > 6)
         assert np.hypot(*labelled(ax, "where the reward is highest").get_xydata().T) == pytest.approx(7)
         assert sorted(patch.get_x() for patch in ax.patches) == [-6, 6]
 
@@ -101,6 +99,35 @@ def test_paths_of_a_run_tell_outside_from_too_fast():
     too_fast = labelled(figure.axes[0], "unsafe: too fast").get_xydata()
     assert len(outside) + len(too_fast) == 80
     assert np.all(outside[:, 1] > 2) and np.all(too_fast[:, 1] <= 2)
+
+
+def test_panels_of_a_wide_scene_stand_below_each_other_and_others_beside_each_other():
+    places = {
+        name: figures.paths(played(name), get_task(name), LIMITS).axes for name in ("CarRun", "CarCircle")
+    }
+    rows = {name: len({ax.get_subplotspec().rowspan.start for ax in axes}) for name, axes in places.items()}
+    assert rows == {"CarRun": 3, "CarCircle": 1}
+    assert [ax.get_aspect() for axes in places.values() for ax in axes] == ["auto"] * 3 + [1] * 3
+
+
+def test_axes_from_above_hold_the_walls_and_the_farthest_of_all_panels():
+    for name, least in (("BallRun", 3), ("BallCircle", 9)):
+        near, far = (played(name, episodes=2) for _ in range(2))
+        near.positions[:] *= 0.1
+        far.positions[:, 0] *= 5
+        assert figures.paths(near, get_task(name), (30, 50)).axes[0].get_ylim() == pytest.approx(
+            (-least, least)
+        )
+        farthest = 1.1 * np.abs(far.positions[:, 0, 1:] if name == "BallRun" else far.positions[:, 0]).max()
+        for ax in figures.paths(far, get_task(name), (30, 50)).axes:
+            assert ax.get_ylim() == pytest.approx((-farthest, farthest))
+
+
+def test_a_task_without_a_scene_has_no_picture_from_above():
+    flat = dataclasses.replace(get_task("BallCircle"), scene=None)
+    for draw in (figures.paths, figures.episode):
+        with pytest.raises(ValueError, match="BallCircle has no scene"):
+            draw(played(), flat, LIMITS if draw is figures.paths else 30)
 
 
 def test_an_episode_that_ends_early_is_drawn_to_its_end():
@@ -124,8 +151,8 @@ def test_budget_draws_cost_limit_and_conditions():
 
 
 def test_an_infinite_condition_has_a_place_and_a_name():
-    conditions = np.full((200, 1), np.inf)
-    figure = figures.budget(played(episodes=1)._replace(conditions=conditions), get_task("BallCircle"), [70])
+    told = np.full((200, 1), np.inf)
+    figure = figures.budget(played(episodes=1)._replace(told=told), get_task("BallCircle"), [70])
     ax = figure.axes[1]
     assert set(labelled(ax, "threshold given").get_ydata()) == {120}
     assert ax.get_yticklabels()[-1].get_text() == "∞"

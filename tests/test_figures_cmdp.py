@@ -36,9 +36,16 @@ def test_all_eight_tasks_are_shown_with_a_ring_around_the_small_robots():
     assert len(figure.axes) == 8 and all(len(ax.images) == 1 for ax in figure.axes)
     pictures = [ax.images[0].get_array().tobytes() for ax in figure.axes]
     assert len(set(pictures)) == 8
+    assert [ax.get_title() for ax in figure.axes] == ["Ball", "Car", "Drone", "Ant"] + [""] * 4
+    assert [ax.get_ylabel() for ax in figure.axes] == ["Run", "", "", "", "Circle", "", "", ""]
     rings = [[patch for patch in ax.patches if isinstance(patch, Circle)] for ax in figure.axes]
     assert [len(ring) for ring in rings] == [0] * 4 + [1] * 4
     assert all(0 < x < 64 and 0 < y < 48 for (ring,) in rings[4:] for x, y in [ring.center])
+
+
+def test_a_family_without_scenes_has_no_pictures():
+    with pytest.raises(ValueError, match="no task of the family 'chess' has a scene"):
+        figures.all_tasks(family="chess")
 
 
 @pytest.mark.parametrize("name", ["BallCircle", "BallRun"])
@@ -47,7 +54,7 @@ def test_drives_show_each_way_and_its_unsafe_steps(name):
     costs = np.abs(way[:, 0]) > 6 if name == "BallCircle" else np.arange(10) % 3 == 0
     drive = SimpleNamespace(positions=way, costs=costs.astype(float), rewards=np.ones(10))
     figure = figures.drives(get_task(name), {"one": drive, "two": drive})
-    join = ": " if name == "BallRun" else "\n"
+    join = ": " if name == "BallRun" else "\n"  # a panel of a Circle is narrow
     titles = [f"{title}{join}cost {costs.sum()}, return 10" for title in ("one", "two")]
     assert [ax.get_title() for ax in figure.axes] == titles
     for ax in figure.axes:

@@ -1,5 +1,7 @@
 """What is counted in recordings, against slow loops and a linear programme."""
 
+import dataclasses
+
 import matplotlib
 import numpy as np
 import pytest
@@ -8,7 +10,7 @@ from scipy.optimize import linprog
 from tutorial_lib.course import checks, figures, widgets
 from tutorial_lib.data import recordings
 from tutorial_lib.data.dataset import Dataset, returns_to_go
-from tutorial_lib.tasks import get_task, make_env
+from tutorial_lib.tasks import DSRL_FRONTIER, TASKS, get_task
 
 
 @pytest.fixture(autouse=True)
@@ -34,22 +36,6 @@ def of_points(points):
     costs, returns = np.array(points, np.float32).T
     rows, zeros = np.ones(len(points), bool), np.zeros((len(points), 8), np.float32)
     return Dataset(zeros, zeros, zeros[:, :2], returns, costs, ~rows, rows)
-
-
-@pytest.mark.parametrize("name", ["BallRun", "CarCircle", "AntRun", "DroneCircle"])
-def test_positions_are_the_simulators(name):
-    env = make_env(name)
-    observation, _ = env.reset(seed=3)
-    before, first = env.position, observation
-    for _ in range(5):
-        last = observation
-        observation, *_ = env.step(np.full(env.task.act_dim, 0.7))
-    flag = np.ones(1, bool)
-    data = Dataset(last[None], observation[None], np.zeros((1, 2)), flag * 1.0, flag * 1.0, ~flag, flag)
-    assert recordings.positions(data)[0] == pytest.approx(env.position, abs=1e-4)
-    start = Dataset(first[None], last[None], np.zeros((1, 2)), flag * 1.0, flag * 1.0, ~flag, flag)
-    assert recordings.positions(start, after=False)[0] == pytest.approx(before, abs=1e-4)
-    env.close()
 
 
 def test_best_left_against_a_filter_for_each_limit():
@@ -164,8 +150,10 @@ def test_filtered_can_leave_nothing():
 def test_visited_counts_every_step_and_marks_the_cost_zone():
     data = random_recordings(np.random.default_rng(3))
     figure = figures.visited({"CarCircle": data, "CarRun": data})
+    after = 10 * data.next_observations[:, :2]  # metres, where the step's cost is decided
     for ax in figure.axes[:2]:
         assert ax.collections[0].get_array().sum() == len(data)
+        assert ax.get_xlim() == pytest.approx((after[:, 0].min(), after[:, 0].max()))
     assert [line.get_xdata()[0] for line in figure.axes[0].lines] == [-6, 6]
     assert [line.get_ydata()[0] for line in figure.axes[1].lines] == [-2, 2]
 
@@ -173,6 +161,23 @@ def test_visited_counts_every_step_and_marks_the_cost_zone():
 def test_examples_left_has_a_bar_for_all_and_one_for_the_good(three):
     (ax,) = figures.examples_left({"BallCircle": three["BallCircle"]}).axes
     assert [bar.get_height() for bar in ax.patches] == [1, 2, 3, 1, 1, 1]
+
+
+def test_figures_have_a_place_for_each_limit_of_a_task(three, monkeypatch):
+    two = dataclasses.replace(get_task("BallCircle"), thresholds=(20, 45), limit_names=("low", "high"))
+    monkeypatch.setitem(TASKS, "BallCircle", two)
+    (ax,) = figures.examples_left({"BallCircle": three["BallCircle"]}).axes
+    assert [bar.get_height() for bar in ax.patches] == [1, 2, 1, 1]
+    assert [label.get_text() for label in ax.get_xticklabels()] == ["20", "45"]
+    (ax,) = figures.planes({"BallCircle": three["BallCircle"]}).axes
+    assert [line.get_xdata()[0] for line in ax.lines if line.get_label() == "threshold"] == [20, 45]
+
+
+def test_planes_of_a_task_without_a_frontier_leave_it_out(three, monkeypatch):
+    monkeypatch.delitem(DSRL_FRONTIER, "BallCircle")
+    (ax,) = figures.planes({"BallCircle": three["BallCircle"]}, frontier=True).axes
+    assert not [line for line in ax.lines if line.get_label().startswith("DSRL")]
+    assert dict(labelled(ax, "best episode left"))[40] == 50
 
 
 def test_at_the_wall_counts_and_averages_per_bin():

@@ -8,8 +8,7 @@ import pytest
 import torch
 
 from tutorial_lib.agents import C2IQL
-from tutorial_lib.config import Config
-from tutorial_lib.costs.reconstruction import CostReconstruction
+from tutorial_lib.costs.reconstruction import CostReconstruction, ReconstructionConfig
 from tutorial_lib.course import undiscounting
 from tutorial_lib.data.sources import load_dataset
 from tutorial_lib.tasks import TASKS, get_task
@@ -47,14 +46,15 @@ def test_the_weight_curve_is_its_loop():
 
 
 def test_linear_weights_are_the_models_slopes():
-    model = CostReconstruction(TASK, Config(crm="linear"))
+    model = CostReconstruction(TASK, ReconstructionConfig(crm="linear"))
     model.mean.copy_(torch.tensor([1.0, 2.0, 3.0]))
     model.whiten.copy_(torch.tensor([[1.0, 2.0, 0.0], [0.0, 3.0, 1.0], [0.5, 0.0, 4.0]]))
     with torch.no_grad():
         slopes = [(model(2 * row) - model(0 * row)).item() / 2 for row in torch.eye(3)]
     assert undiscounting.linear_weights(model) == pytest.approx(slopes, rel=1e-4)
     with pytest.raises(ValueError, match="linear"):
-        undiscounting.linear_weights(CostReconstruction(TASK, Config(crm_width=4, crm_layers=1)))
+        small = ReconstructionConfig(crm_width=4, crm_layers=1)
+        undiscounting.linear_weights(CostReconstruction(TASK, small))
 
 
 def test_steady_heads_are_sums_over_the_steps_that_each_treatment_sees():
@@ -73,14 +73,15 @@ def test_steady_heads_are_sums_over_the_steps_that_each_treatment_sees():
 @pytest.mark.parametrize("time_limits", ["rate", "bootstrap"])
 def test_critic_heads_are_what_the_reconstruction_is_given(time_limits):
     """By the agent's own path: a reconstruction that hands its inputs through."""
-    config = dataclasses.replace(Config(), time_limits=time_limits, hidden_width=8, crm_width=4, crm_layers=1)
+    config = C2IQL.configure(time_limits=time_limits, hidden_width=8, crm_width=4, crm_layers=1)
     agent, data = C2IQL(get_task("BallRun"), config), load_dataset("BallRun")
     found = undiscounting.critic_heads(agent, data, n=7, seed=3)
     rows = np.random.default_rng(3).choice(len(data), 7, replace=False)
     given = []
-    agent.reconstruction.forward = lambda heads: given.append(heads) or undiscounting.sum(-1)
-    s = agent.network_input(torch.tensor(data.observations[rows]), torch.full((7,), 50.0))
-    agent.episode_cost(agent.network("cost_critics")(s, torch.tensor(data.actions[rows])))
+    agent.reconstruction.forward = lambda heads: given.append(heads) or heads.sum(-1)
+    net = agent.networks()
+    s = agent.network_input(net, torch.tensor(data.observations[rows]), torch.full((7,), 50.0))
+    agent.episode_cost(net.cost_critics(s, torch.tensor(data.actions[rows])))
     np.testing.assert_allclose(found, given[0][0].numpy(), rtol=1e-4)
 
 

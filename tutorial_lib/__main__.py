@@ -13,7 +13,6 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-Positional = tyro.conf.Positional
 Device = Literal["cpu", "cuda"]
 
 
@@ -30,7 +29,7 @@ def tasks() -> None:
     print(pd.DataFrame(rows).to_string(index=False))
 
 
-def fetch(task: Positional[str], directory: Path | None = None) -> None:
+def fetch(task: tyro.conf.Positional[str], directory: Path | None = None) -> None:
     """Download DSRL's dataset of a task, and check it.
 
     Args:
@@ -43,7 +42,7 @@ def fetch(task: Positional[str], directory: Path | None = None) -> None:
 
 
 def collect(
-    task: Positional[str],
+    task: tyro.conf.Positional[str],
     out: Path | None = None,
     sources: tuple[str, ...] = ("priced-0", "lagrangian-0"),
     steps: int | None = None,
@@ -66,13 +65,11 @@ def collect(
     """
     from tutorial_lib.data import collect as collecting
     from tutorial_lib.tasks import get_task
+    from tutorial_lib.tasks.recipes import RECIPES
 
     check_counts(steps=steps, episodes=episodes, workers=workers)
-    recipe = collecting.RECIPES[get_task(task).name]
-    changes = {"steps": steps, "episodes": episodes}
-    recipe = dataclasses.replace(
-        recipe, **{key: value for key, value in changes.items() if value is not None}
-    )
+    recipe = RECIPES[get_task(task).name]
+    recipe = dataclasses.replace(recipe, steps=steps or recipe.steps, episodes=episodes or recipe.episodes)
     out = out or runs / f"{get_task(task).name}.hdf5"
     dataset = collecting.collect(get_task(task), sources, recipe, runs, out, workers)
     print(f"{out}: {dataset.num_episodes} episodes, {len(dataset)} transitions")
@@ -111,7 +108,7 @@ def train(words: tuple[str, ...] = ()) -> None:
 
 
 def evaluate(
-    agent: Positional[Path],
+    agent: tyro.conf.Positional[Path],
     out: Path | None = None,
     limits: tuple[float, ...] | None = None,
     episodes: int = 10,
@@ -140,7 +137,7 @@ def evaluate(
 
 
 def study(
-    name: Positional[str],
+    name: tyro.conf.Positional[str],
     only: str = "*",
     scheduler: str | None = None,
     workers: int | None = None,
@@ -188,15 +185,15 @@ def study(
         failures = cluster.run_all(chosen, folder, client)
     done = of_study.collect(grid, folder, out, keep=not trial)
     print(f"{out}: {done} of {len(grid)} entries are finished here")
-    for entry, reason in failures.items():
-        print(f"FAILED {entry}: {reason}")
+    for failed, reason in failures.items():
+        print(f"FAILED {failed}: {reason}")
     if failures:
         raise ValueError(
             f"{len(failures)} of {len(chosen)} entries failed; run the study again to try them again"
         )
 
 
-def report(name: Positional[str | None] = None) -> None:
+def report(name: tyro.conf.Positional[str | None] = None) -> None:
     """Make tables and figures from the results' files: of one study, or all, and the pages that show them.
 
     Args:

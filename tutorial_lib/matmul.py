@@ -18,7 +18,7 @@ def products():
 
     Only the order of sums may change; other devices are left alone.
     """
-    matmul = torch.backends.mkldnn.matmul
+    matmul = torch.backends.mkldnn.matmul  # type: ignore[attr-defined]
     before = matmul.fp32_precision
     try:
         matmul.fp32_precision = "bf16"

@@ -1,9 +1,12 @@
-"""Options on the command line: those of `c2iql train`, which depend on the algorithm, and a study's changes."""
+"""Options for people: those of `c2iql train`, which depend on the algorithm, a study's changes, and a
+table."""
 
+import ast
 import dataclasses
+import inspect
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
@@ -16,7 +19,7 @@ from tutorial_lib.tasks import get_task
 class Training:
     """What `c2iql train` is told besides the options of the algorithm."""
 
-    task: tyro.conf.Positional[str]
+    task: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="TASK")]
     """Which task, e.g. BallCircle."""
     config: tyro.conf.OmitArgPrefixes[Any]
     seeds: tuple[int, ...] = (0,)
@@ -47,7 +50,7 @@ def parse_training(words: list[str]) -> tuple[type[Agent], Training]:
     default = kind.configure(profile, task)
     options = dataclasses.make_dataclass(
         "Options",
-        [("config", tyro.conf.OmitArgPrefixes[kind.Config], dataclasses.field(default=default))],
+        [("config", Annotated[kind.Config, tyro.conf.OmitArgPrefixes], dataclasses.field(default=default))],
         bases=(Training,),
         frozen=True,
         kw_only=True,
@@ -75,3 +78,14 @@ def with_options(config: Config, options: Sequence[str]) -> Config:
             ) from None
         changes[name] = getattr(parsed, name)
     return config.changed(**changes)
+
+
+def describe(kind: type[Config]) -> dict[str, str]:
+    """What each option of a class of options means, by name: the docstrings that follow the fields."""
+    words: dict[str, str] = {}
+    for owner in reversed(kind.__mro__[:-1]):  # not object
+        body = ast.parse(inspect.getsource(owner)).body[0].body  # type: ignore[attr-defined]
+        for field, following in zip(body, body[1:], strict=False):
+            if isinstance(field, ast.AnnAssign) and isinstance(following, ast.Expr):
+                words[field.target.id] = " ".join(ast.literal_eval(following.value).split())  # type: ignore
+    return {field.name: words[field.name] for field in dataclasses.fields(kind)}

@@ -7,6 +7,7 @@ colour-blind readers tell apart).
 import base64
 import functools
 import io
+from typing import Any
 
 import matplotlib
 import matplotlib.pyplot as plt
@@ -16,7 +17,7 @@ from PIL import Image
 
 REWARD, COST, LIMIT, NEUTRAL = "#0072B2", "#D55E00", "#222222", "#8A8A8A"
 DASHED = {"color": LIMIT, "linestyle": (0, (4, 2)), "linewidth": 2}
-STYLE = {
+STYLE: Any = {
     "font.size": 14,
     "axes.titlesize": 15,
     "axes.labelsize": 14,
@@ -46,7 +47,10 @@ class Picture(Figure):
         display({"image/png": png, "text/plain": repr(self)}, raw=True)
 
 
-subplots = functools.partial(plt.subplots, FigureClass=Picture)
+def subplots(*args: Any, **options: Any) -> tuple[Picture, Any]:
+    """matplotlib's `subplots`, whose figure is a `Picture`: the figure and its axes."""
+    figure, axes = plt.subplots(*args, FigureClass=Picture, **options)  # type: ignore[call-overload]
+    return figure, axes
 
 
 def one_figure(draw):

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from tutorial_lib.agents import lift
 from tutorial_lib.agents.player import Player
 from tutorial_lib.agents.seeds import Fields, Networks, Rates, Runs
-from tutorial_lib.config import Config
+from tutorial_lib.config import Config as AnyConfig
 from tutorial_lib.costs.conditioning import check_limit
 from tutorial_lib.data.dataset import Batch, Dataset, sample_batch
 from tutorial_lib.tasks import Task
@@ -37,9 +37,12 @@ class Agent(Runs):
     """
 
     name: ClassVar[str]
-    Config: ClassVar[type[Config]] = Config
+    Config: ClassVar[type[AnyConfig]] = AnyConfig
+    """The class of its options."""
     needs_limit: ClassVar[bool] = False
     """Is a run trained for one limit? If not, it knows no limit, or is told one when it plays."""
+    scalars: ClassVar[dict[str, str]] = {}
+    """What the log says at each of its updates, by name: every loss as NAME_loss, and what `losses` adds."""
     in_table1: ClassVar[bool] = True
     """Is it a row of Table 1? Ablations and building blocks are not."""
     at_test: ClassVar[tuple[str, ...]] = ()
@@ -48,7 +51,7 @@ class Agent(Runs):
     def __init__(
         self,
         task: Task,
-        config: Config,
+        config: AnyConfig,
         seeds: Sequence[int] = (0,),
         limits: float | Sequence[float] | None = None,
         device: torch.device | str = "cpu",
@@ -66,6 +69,7 @@ class Agent(Runs):
             raise ValueError(
                 f"seeds {list(self.seeds)}: at least one, each 0 or more and there once per limit"
             )
+        self.steps_variables = type(self).step is not Agent.step
         self.build_runs()
         self.data_checksum: str | None = None  # of the dataset that the runs were trained on
 
@@ -138,7 +142,7 @@ class Agent(Runs):
         """What the networks see of observations (..., obs) and limits (...): the normalised observations."""
         return (observations - net.observation_mean) / net.observation_std
 
-    def player(self, limits: np.ndarray, seeds: Sequence[int], run: int = 0) -> Player:
+    def player(self, limits: Sequence[float] | np.ndarray, seeds: Sequence[int], run: int = 0) -> Player:
         """Plays E episodes of one run at once, under limits (E,); its chances come from seeds (E,)."""
         return Player(self, limits, run)
 
@@ -156,7 +160,7 @@ class Agent(Runs):
     # What they all share -----------------------------------------------------------------------------
 
     @classmethod
-    def configure(cls, profile: str = "small", task: Task | None = None, **changes: Any) -> Config:
+    def configure(cls, profile: str = "small", task: Task | None = None, **changes: Any) -> AnyConfig:
         """The options of a profile, with the task's own where one is given, and with `changes` made last.
 
         Raises ValueError for an unknown profile, an option that the algorithm does not read, or a value out
@@ -188,11 +192,6 @@ class Agent(Runs):
         other = type(self).__new__(type(self))
         vars(other).update(vars(self) | {"config": self.config.changed(**changes)})
         return other
-
-    @property
-    def steps_variables(self) -> bool:
-        """Does the algorithm write `step`?"""
-        return type(self).step is not Agent.step
 
     def _check_limits(self, limits: float | Sequence[float] | None) -> tuple[float, ...] | None:
         """One limit per run, or None for algorithms that are trained for none."""

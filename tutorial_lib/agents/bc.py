@@ -47,6 +47,7 @@ class BCAll(Agent):
 
     name = "BC-All"
     Config = BCConfig
+    scalars = {"policy_loss": "mean squared error of the actions"}
     config: BCConfig
 
     def build(self):

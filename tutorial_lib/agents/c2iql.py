@@ -15,6 +15,7 @@ The two ablations of Section 4.2 are the classes below C2IQL, each one switch aw
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -69,6 +70,8 @@ class WithoutCCConfig(ConstrainedConfig, ReconstructionConfig):
 class BudgetPlayer(Player):
     """Tells the policy, at every step, what is left of the limit (eq. 23)."""
 
+    agent: "C2IQL"
+
     def __init__(self, agent: "C2IQL", limits: np.ndarray, run: int = 0):
         super().__init__(agent, limits, run)
         self.spent, self.t = np.zeros(len(self.limits)), 0
@@ -90,8 +93,12 @@ class C2IQL(ConstrainedAgent):
     """Algorithm 2. The numbers of its lines stand beside the code that does them."""
 
     name = "C2IQL"
-    Config = C2IQLConfig
-    at_test = ("infinite_at_test",)
+    Config: ClassVar[type[ConstrainedConfig]] = C2IQLConfig
+    config: Any  # C2IQLConfig, without what the ablations have not
+    scalars = ConstrainedAgent.scalars | {
+        "cost_mean": "mean expected cost of an episode, in unsafe steps: what line 9 compares with the limit",
+    }
+    at_test: ClassVar[tuple[str, ...]] = ("infinite_at_test",)
     conditioned = True
     reconstructs = True
 

@@ -78,15 +78,22 @@ class CPQ(CriticAgent):
     """Equations 3 and 4 for one finite limit L, compared with discounted costs as L~ (eq. 2)."""
 
     name = "CPQ"
-    Config: type[CPQConfig] = CPQConfig
+    Config = CPQConfig
     config: CPQConfig
     needs_limit = True
+    scalars = {
+        "critic_loss": "squared error of the Q_r, summed over the ensemble (eq. 3)",
+        "cost_critic_loss": "squared error of the Q_c, summed over the ensemble, and the push",
+        "policy_loss": "minus the penalised Q_r of the policy's own actions (eq. 4)",
+        "safe_fraction": "share of the policy's actions whose expected cost keeps L~",
+        "negative_q": "share of the policy's actions with Q_r < 0, where a penalty of zero is a reward",
+    }
     targets = ("critics", "cost_critics")
     frozen = ("critics", "cost_critics")
 
     def __init__(self, *args, **kwargs):
         super().__init__(*args, **kwargs)
-        if float("inf") in self.limits:
+        if float("inf") in (self.limits or ()):
             raise ValueError(f"{self.name} needs a finite limit: without one nothing is unsafe")
         # Where all actions look unsafe the policy has no gradient (eq. 4), so let all look safe at first.
         self.fill_last_bias(("cost_critics",), [-1.0] * len(self.seeds))
@@ -144,6 +151,12 @@ class PushedCPQ(CPQ):
     name = "CPQ w/ push"
     in_table1 = False
     Config = PushedCPQConfig
+    scalars = CPQ.scalars | {
+        "vae_loss": "squared error and KL divergence of the conditional VAE",
+        "outside_cost": "mean expected cost of the policy's actions outside the data, in discounted cost",
+        "shortfall": "how much less this is than 1.5 L~, in discounted cost",
+        "alpha": "the multiplier of the shortfall",
+    }
     config: PushedCPQConfig
 
     def build(self):

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from torch import Tensor
 
@@ -62,7 +62,7 @@ class ImplicitAgent(CriticAgent):
     """IQL, CIQL and C2IQL: value functions and critics, and a policy that is extracted from them."""
 
     config: ImplicitConfig
-    targets = ("critics",)
+    targets: ClassVar[tuple[str, ...]] = ("critics",)
 
     def optimiser(self, name: str) -> Rates:
         if name == "policy":
@@ -75,8 +75,21 @@ class ConstrainedAgent(ImplicitAgent):
 
     config: ConstrainedConfig
     targets = ("critics", "cost_critics")
-    extra_inputs = 0
-    """Inputs of every network besides the observation."""
+    scalars = {
+        "value_loss": "expectile loss of V_r (eq. 12)",
+        "cost_value_loss": "weighted squared error of V_c (eq. 17)",
+        "critic_loss": "squared error of the Q_r, summed over the ensemble (line 16)",
+        "cost_critic_loss": "squared error of the Q_c, summed over the ensemble (eq. 16, line 18)",
+        "policy_loss": "minus the weighted log-likelihood of the recorded actions (eq. 18)",
+        "safe_fraction": "share of recorded actions whose expected cost keeps the limit",
+        "value_mean": "mean of V_r, in discounted reward",
+        "negative_q": "share of recorded actions with Q_r < 0, where a penalty of zero is a reward",
+    }
+
+    @property
+    def extra_inputs(self) -> int:
+        """Inputs of every network besides the observation."""
+        return 0
 
     @property
     def cost_gammas(self) -> tuple[float, ...]:

@@ -34,6 +34,12 @@ class IQL(ImplicitAgent):
     name = "IQL"
     Config = IQLConfig
     in_table1 = False
+    scalars = {
+        "value_loss": "expectile loss of V_r (eq. 6)",
+        "critic_loss": "squared error of the Q_r, summed over the ensemble (eq. 7)",
+        "policy_loss": "minus the weighted log-likelihood of the recorded actions (eq. 8)",
+        "value_mean": "mean of V_r, in discounted reward",
+    }
     config: IQLConfig
 
     def build(self):

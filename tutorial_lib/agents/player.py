@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,7 +19,7 @@ class Player:
     by chance, has a player of its own (`Agent.player`).
     """
 
-    def __init__(self, agent: Agent, limits: np.ndarray, run: int = 0):
+    def __init__(self, agent: Agent, limits: Sequence[float] | np.ndarray, run: int = 0):
         self.agent, self.limits, self.run = agent, np.asarray(limits, float), run
 
     @property

@@ -55,6 +55,7 @@ class Runs:
     frozen: ClassVar[tuple[str, ...]] = ()
     """Networks that some loss looks through without training them."""
     steps_variables: bool
+    """Does the algorithm write `step`?"""
 
     def build(self) -> dict[str, nn.Module | Tensor]:
         raise NotImplementedError
@@ -74,7 +75,8 @@ class Runs:
     def build_runs(self) -> None:
         """Make the tensors of all runs, each drawn with its seed, and Adam for those that are trained."""
         runs = [self._build_seeded(seed) for seed in self.seeds]
-        networks, variables = {}, {}
+        networks: dict[str, Any] = {}
+        variables: dict[str, Any] = {}
         for name, part in runs[0].items():
             (networks if isinstance(part, nn.Module) else variables)[name] = [run[name] for run in runs]
 
@@ -224,7 +226,8 @@ class Runs:
         """One run's losses, summed, and its scalars, as a function of its tensors."""
         losses, scalars = self.losses(self._net(own, self._borrowers), Fields(**batch))
         scalars = {f"{name}_loss": loss for name, loss in losses.items()} | scalars
-        return sum(losses.values()), {name: value.detach() for name, value in scalars.items()}
+        total: Any = sum(losses.values())
+        return total, {name: value.detach() for name, value in scalars.items()}
 
     def _step_variables(self, batch: dict[str, Tensor], scalars: dict[str, Tensor]) -> None:
         """Give every run the new values of its variables."""

@@ -57,10 +57,15 @@ class ReconstructionConfig(Config):
 class CostReconstruction(nn.Module):
     """R^c of eq. 21: discounted costs (..., m) to an undiscounted cost (...,).
 
-    Discounted sums of one sequence are nearly equal once scaled, and all the news is in their small
-    differences. So the inputs are whitened first (mean zero, uncorrelated, variance one on the noisy
+    Discounted sums of one sequence are nearly equal once scaled, and only their small differences tell
+    anything. So the inputs are whitened first (mean zero, uncorrelated, variance one on the noisy
     training data): the same network then learns in thousands of steps what it else needs a million for.
     """
+
+    mean: Tensor
+    """Of the inputs, (m,)."""
+    whiten: Tensor
+    """The matrix that makes them uncorrelated with variance one, (m, m)."""
 
     def __init__(self, task: Task, config: ReconstructionConfig):
         super().__init__()
@@ -126,8 +131,9 @@ def train_reconstruction(
         # With whitened inputs, least squares is a mean; the noise in the covariance is its ridge penalty.
         with torch.no_grad():
             white = centred @ model.whiten.to(x)
-            model.net.weight.copy_((share * (y - share @ y) / task.horizon) @ white)
-            model.net.bias.copy_(share @ y / task.horizon)
+            weight, bias = model.net.parameters()
+            weight.copy_((share * (y - share @ y) / task.horizon) @ white)
+            bias.copy_(share @ y / task.horizon)
         return model.requires_grad_(False)
 
     x, y, boundary = x.float(), y.float(), len(sums[0][1])

@@ -112,7 +112,8 @@ def train_critic(
             torch._foreach_lerp_(
                 list(critic.target_critics.parameters()), list(critic.critics.parameters()), tau
             )
-    return Course(*np.array(notes).T, critic)
+    at, q = np.array(notes).T
+    return Course(at, q, critic)
 
 
 def play_greedy(critic: Critic, task, gamma: float = 0.99, seed: int = 0, points: int = 21):

@@ -97,7 +97,7 @@ class Dataset:
         """SHA-256 of all values, in hexadecimal: the same for the same data, however a file packs them."""
         digest = hashlib.sha256()
         for key in KEYS:
-            digest.update(np.ascontiguousarray(getattr(self, key)))
+            digest.update(np.ascontiguousarray(getattr(self, key)).data)
         return digest.hexdigest()
 
     def select(self, episodes) -> "Dataset":

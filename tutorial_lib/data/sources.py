@@ -117,7 +117,8 @@ def _download(base_url: str, name: str, folder: Path) -> Path:
     try:
         return Path(server.fetch(name, downloader=pooch.HTTPDownloader(progressbar=True, chunk_size=2**16)))
     except requests.HTTPError as error:
-        status = f"{error.response.status_code} {error.response.reason}"
+        answer = error.response
+        status = "no" if answer is None else f"{answer.status_code} {answer.reason}"
         raise DatasetError(f"{url}: the server said {status}: has the file moved?") from error
     except requests.RequestException as error:
         remedy = f"check the network and try again, or put the file into {folder.parent} yourself"

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from tutorial_lib.agents import C2IQL
+from tutorial_lib.agents.c2iql import C2IQLConfig
 from tutorial_lib.costs.conditioning import threshold_set
 from tutorial_lib.data.recordings import best_left
 from tutorial_lib.data.sources import SHIPPED_DATA, load_dataset, shipped_tasks
@@ -144,7 +144,7 @@ def paper_profile_table() -> str:
         return "*Not run.*"
     same = small["task"].isin(paper["task"]) & (small["algorithm"] == "C2IQL")
     paper = paper.sort_values(["cost_critics", "updates"], kind="stable")
-    both = pd.concat([paper, small[same].assign(cost_critics=C2IQL.configure("small").cost_critics)])
+    both = pd.concat([paper, small[same].assign(cost_critics=C2IQLConfig.make("small").cost_critics)])
     words = both["profile"] + ", " + both["updates"].map("{:,} updates".format)
     table = markdown(study_table(both.assign(run=words)))
     return f"{table}\n\n![what the critics expect](results/paper-profile.png)"
@@ -156,7 +156,7 @@ def write_paper_profile() -> Path | None:
     if not len(log):
         return None
     task = get_task(load_results("paper-profile")["task"].iloc[0])
-    told = threshold_set(task, with_zero=C2IQL.configure("paper").zero_threshold)
+    told = threshold_set(task, with_zero=C2IQLConfig.make("paper").zero_threshold)
     figure = expected_costs(log, load_dataset(task.name).episode_costs.mean(), np.isinf(told).mean())
     return drawn(figure, RESULTS / "paper-profile.png")
 

@@ -78,7 +78,7 @@ def difference(results: pd.DataFrame, score: str, high: dict, low: dict | float)
 
     def of(rows: dict | float, like: pd.Series | None = None) -> pd.Series:
         if not isinstance(rows, dict):
-            return pd.Series(float(rows), index=like.index)
+            return pd.Series(float(rows), index=None if like is None else like.index)
         chosen = results[np.logical_and.reduce([results[key] == value for key, value in rows.items()])]
         if chosen.empty:
             return pd.Series(dtype=float)

@@ -18,12 +18,13 @@ def check_paired_interval(answer: Callable) -> None:
         ([0.5, 0.9, 0.7], [0.6, 0.6, 0.6], "take the differences seed by seed, and divide by n - 1"),
         ([0.1, 0.2, 0.4, 0.3, 0.3], [0.3, 0.2, 0.1, 0.1, 0.5], "five seeds have four degrees of freedom"),
     ):
-        first, second = np.array(first), np.array(second)
-        if np.ptp(first - second) < 1e-9:
-            expected = np.repeat((first - second).mean(), 2)
+        pair = np.array(first), np.array(second)
+        differences = pair[0] - pair[1]
+        if np.ptp(differences) < 1e-9:
+            expected = np.repeat(differences.mean(), 2)
         else:
-            expected = np.array(stats.ttest_rel(first, second).confidence_interval(0.95))
-        cases.append(((first, second), expected, hint))
+            expected = np.array(stats.ttest_rel(*pair).confidence_interval(0.95))
+        cases.append((pair, expected, hint))
     try_answer(answer, cases)
 
 

@@ -99,8 +99,9 @@ def _draw_grid(ax, shade=None, layout=tabular.SHORTCUT):
     for kind, (x, y), dark in zip("".join(layout), _places(layout), shade, strict=True):
         ax.add_patch(Rectangle((x - 0.5, y - 0.5), 1, 1, color=str(1 - 0.45 * dark), linewidth=0))
         if kind == "h":
-            frame = {"fill": False, "edgecolor": COST, "linewidth": 2, "hatch": "//", "alpha": 0.55}
-            ax.add_patch(Rectangle((x - 0.46, y - 0.46), 0.92, 0.92, **frame))
+            frame = Rectangle((x - 0.46, y - 0.46), 0.92, 0.92, fill=False, edgecolor=COST, linewidth=2)
+            frame.set(hatch="//", alpha=0.55)
+            ax.add_patch(frame)
         elif kind != " ":
             ax.text(x - 0.44, y + 0.42, kind, ha="left", va="top", fontsize=17, fontweight="bold")
     rows, columns = len(layout), len(layout[0])

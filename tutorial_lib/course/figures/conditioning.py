@@ -54,7 +54,7 @@ def against_optimum(limits, curves: dict, thresholds=()):
     The first is the measure of the others: a broad pale line. Thresholds are ticks at the bottom.
     """
     figure, axes = subplots(1, 2, figsize=(12, 4.8))
-    looks = [dict(color=REWARD, alpha=0.35, linewidth=9), dict(color=LIMIT, linestyle=":"),
+    looks: list[dict] = [dict(color=REWARD, alpha=0.35, linewidth=9), dict(color=LIMIT, linestyle=":"),
              dict(color=COST), dict(color=NEUTRAL)]  # fmt: skip
     for (name, pair), look in zip(curves.items(), looks, strict=False):
         for ax, values in zip(axes, pair, strict=True):

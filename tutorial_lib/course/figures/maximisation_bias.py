@@ -24,7 +24,8 @@ def two_maxima(seed: int = 0, arms: int = 20, degree: int = 2):
     grid = np.linspace(-1, 1, 401)
     actions, rewards = bandit_logs(rng)
     for line in range(6):
-        fit = np.polyval(np.polyfit(*((actions, rewards) if line == 0 else bandit_logs(rng)), degree), grid)
+        x, y = (actions, rewards) if line == 0 else bandit_logs(rng)
+        fit = np.polyval(np.polyfit(x, y, degree), grid)
         support.plot(grid, fit, color=COST, linewidth=1.5, alpha=0.5, label="fits of logs like these")
         support.plot(grid[fit.argmax()], fit.max(), **STAR)
     support.plot(actions, rewards, "o", color=NEUTRAL, markersize=6, label="recorded", zorder=3)

@@ -30,8 +30,8 @@ def shortcut(slip: float = 0.1, gamma: float = 0.9, layout=SHORTCUT) -> CMDP:
                 transitions[state, action, row * columns + column] += chance
     goal = cells == "G"
     transitions[goal] = np.eye(len(cells))[goal, None]
-    per_state = [np.repeat((cells == kind)[:, None].astype(float), 4, axis=1) for kind in "Gh"]
-    return CMDP(transitions, *per_state, (cells == "S").astype(float), gamma)
+    rewards, costs = (np.repeat((cells == kind)[:, None].astype(float), 4, axis=1) for kind in "Gh")
+    return CMDP(transitions, rewards, costs, (cells == "S").astype(float), gamma)
 
 
 def random_cmdp(

@@ -41,10 +41,10 @@ def solve_episodes(cmdp: CMDP, horizon: int, limit: float = np.inf) -> Solution:
     expected sum of costs. The policy, (horizon, S, A), depends on the step. Raises ValueError as `solve`.
     """
     states, actions = cmdp.rewards.shape
-    unrolled = np.zeros((horizon, states, actions, horizon, states))
+    steps = np.zeros((horizon, states, actions, horizon, states))
     for t in range(horizon - 1):  # the last step leads nowhere
-        unrolled[t, :, :, t + 1] = cmdp.transitions
-    unrolled = unrolled.reshape(horizon * states, actions, horizon * states)
+        steps[t, :, :, t + 1] = cmdp.transitions
+    unrolled = steps.reshape(horizon * states, actions, horizon * states)
     initial = np.concatenate([cmdp.initial, np.zeros((horizon - 1) * states)])
     rewards, costs = (np.tile(signal, (horizon, 1)) for signal in (cmdp.rewards, cmdp.costs))
     found = _solve(unrolled, rewards, costs, initial, 1.0, limit)
