@@ -1,7 +1,8 @@
-"""What this machine can do: `python -m benchmarks` measures training and simulation in about a minute.
+"""How fast this machine trains and simulates: `python -m benchmarks` measures it in about a minute.
 
-`python -m benchmarks --full` measures every algorithm, a plain version of C2IQL and other libraries' algorithms, and
-how cost grows with seeds, batch and data, in some minutes. Tables and figure of speed are made of its files.
+`python -m benchmarks --full` takes some minutes. It measures every algorithm, a plain version of C2IQL, other
+libraries' algorithms, and how the time grows with seeds, batch size and data. The tables and the figure of
+speed are made from its files.
 """
 
 import platform
@@ -9,6 +10,7 @@ from collections.abc import Callable, Sequence
 from datetime import date
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import joblib
 import pandas as pd
@@ -20,7 +22,8 @@ from benchmarks.cases import TASKS, groups, measure, side_by_side
 from benchmarks.peers import install
 from benchmarks.simulation import simulation
 from benchmarks.tables import FILES, FOLDER, part_shares, with_shares
-from benchmarks.updates import PARTS, PRODUCT, Case
+from benchmarks.updates import PARTS, PRODUCT, Case, Device
+from tutorial_lib.agents import get_algorithm
 from tutorial_lib.config import PROFILES
 from tutorial_lib.files import written_whole
 from tutorial_lib.matmul import bfloat16_time
@@ -28,19 +31,19 @@ from tutorial_lib.tasks import Task, get_task
 
 __all__ = ["PARTS", "bench", "full", "install", "machine", "training"]
 BUSY = 10
-"""Percent of the cores' time that others take, from which two processes are not compared with one."""
+"""Percent of the cores' time. Where other programs take more, two processes are not compared with one."""
 
 
 def bench(
-    task: Task, workers: int | None = None, rounds: int = 3, seconds: float = 0.6, device="cpu"
+    task: Task, workers: int | None = None, rounds: int = 3, seconds: float = 0.6, device: Device = "cpu"
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Both tables, `training` and `simulation`.
 
     A measurement of training lasts `seconds` or one update, on a GPU twice that.
     """
     workers = workers or joblib.cpu_count()  # the cores that this process may use
-    name, kinds = task.name, ({}, {"runs": 3}, {"products": "bfloat16"})
-    cases = [Case("C2IQL", name, profile, **kind) for profile in PROFILES for kind in kinds]
+    kinds: tuple[dict[str, Any], ...] = ({}, {"runs": 3}, {"products": "bfloat16"})
+    cases = [Case("C2IQL", task.name, profile, **kind) for profile in PROFILES for kind in kinds]
     with tqdm(total=(rounds + 1) * (len(cases) + 6), desc="measuring", leave=False) as bar:
         return (
             training(cases, rounds, seconds, device, bar.update),
@@ -52,21 +55,25 @@ def training(
     cases: Sequence[Case],
     rounds: int = 3,
     seconds: float = 0.6,
-    device="cpu",
+    device: Device = "cpu",
     done: Callable[[], object] = lambda: None,
 ) -> pd.DataFrame:
-    """One row per case of one task and algorithm: updates per second, each part's share of the time.
+    """One row per case of one task and algorithm: updates per second, and each part's share of the time.
 
-    Real updates on random transitions: how long they take does not depend on what they hold.
-    `hours` is what the profile's number of updates would take, without its reconstruction model; `of_product`
-    compares the arithmetic per second with that of one large float32 product of matrices.
+    These are real updates on random transitions. `hours` is the time of all updates of the profile, without
+    the training of the reconstruction model. `of_product` is the arithmetic per second as a share of that of
+    one large product of float32 matrices.
     """
     found = with_shares(measure([Case(PRODUCT, cases[0].task), *cases], rounds, seconds, device, done))
     rows, by = [], ["profile", "products", "runs"]
+    algorithm = get_algorithm(cases[0].what)
     for (profile, precision, runs), part in found[found["what"] != PRODUCT].groupby(by, sort=False):
         speed = 1 / part["seconds"].median()
         row = {"profile": profile, "runs": runs, "precision": precision, "updates_per_second": speed}
-        row |= {"hours": PROFILES[profile].steps / speed / 3600, "of_product": part["share"].median()}
+        row |= {
+            "hours": algorithm.configure(profile).updates / speed / 3600,
+            "of_product": part["share"].median(),
+        }
         rows.append(row | dict(part_shares(part).median()))
     return pd.DataFrame(rows)
 
@@ -76,13 +83,13 @@ def full(
     workers: int | None = None,
     rounds: int = 3,
     seconds: float = 0.3,
-    device="cpu",
+    device: Device = "cpu",
     missing: Callable[[str], object] = tqdm.write,
 ) -> list[Path]:
-    """Measure everything on one thread and write `folder`'s files, whose paths it returns."""
+    """Measure everything on one thread, and write the files of `folder`. Returns their paths."""
     torch.set_num_threads(1)
     workers, busy = workers or joblib.cpu_count(), psutil.cpu_percent(interval=1)
-    everything, parts = groups(), []
+    everything, parts = groups(), list[pd.DataFrame]()
 
     def write(name: str, tables: list[pd.DataFrame]) -> None:
         with written_whole(folder / FILES[name]) as temporary:
@@ -106,8 +113,8 @@ def full(
     return [folder / file for file in FILES.values()]
 
 
-def machine(device, busy: float) -> pd.DataFrame:
-    """What the numbers hold for: one row per fact."""
+def machine(device: Device, busy: float) -> pd.DataFrame:
+    """The machine and the software that were measured, one row per fact."""
     lines = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else []
     names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
     facts = {

@@ -20,22 +20,23 @@ def main(
     peers: bool = False,
     report: bool = False,
 ) -> None:
-    """Measure this machine, in about a minute: how fast agents train, and how fast simulators step.
+    """Measure in about a minute how fast this machine trains agents and plays episodes.
 
-    The table of training has updates per second, the hours that all the profile's updates take, the rate of
-    arithmetic against that of one large matrix product, and the share of the time of each part of an update.
-    The table of simulation compares with the bare simulator's speed times the processes. What else runs on
-    the machine counts, too.
+    The table of training has the updates per second, the hours of all updates of the profile, the arithmetic
+    per second as a share of that of one large matrix product, and each part's share of an update's time. The
+    table of simulation has the steps per second, and their share of the bare simulator's speed times the
+    processes. Everything else that runs on the machine changes these numbers.
 
     Args:
         task: which task's simulator and sizes.
         workers: processes for rollouts; default one for each core.
         rounds: how often each speed is measured; the median is shown.
-        device: of the training: cpu or cuda.
-        full: measure every algorithm, other libraries' too, at two tasks' sizes, in some minutes, and write
-            data/results/bench/; then `--report` makes tables and a figure of it.
-        peers: first install the other libraries for --full with pip, into runs/bench/peers.
-        report: only write the tables and the figure of the last --full into README.md and data/README.md.
+        device: where to train, cpu or cuda.
+        full: measure every algorithm and the other libraries on two tasks, in some minutes, and write the
+            files in data/results/bench.
+        peers: first install the other libraries with pip into runs/bench/peers.
+        report: measure nothing, and write the tables and the figure of the last --full into README.md and
+            data/README.md.
     """
     if report:
         print("\n".join(f"wrote {path}" for path in pages.write()))

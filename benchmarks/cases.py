@@ -1,36 +1,39 @@
-"""What is measured, and in which turns.
+"""What is measured, and in which order.
 
-Machines are noisy, so what is compared is measured in turns, several times: a ratio is the median of the
-ratios of measurements that stand side by side. Numbers depend on what else is running.
+Machines are noisy. So everything that is compared is measured in turns, over several rounds, and a ratio is
+the median of the ratios of the rounds. All numbers depend on what else is running.
 """
 
-import contextlib
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict
-from multiprocessing import get_context
 
+import joblib
 import pandas as pd
 import torch
+from joblib.externals.loky import get_reusable_executor
 
 from benchmarks.peers import PEERS, Peer
-from benchmarks.updates import EAGER, PRODUCT, Case, OurUpdates, Steps
+from benchmarks.updates import EAGER, PRODUCT, Case, Device, OurUpdates, Steps
 from tutorial_lib.agents import ALGORITHMS
 from tutorial_lib.config import PROFILES
 from tutorial_lib.tasks import TASKS as ALL_TASKS
 
 TASKS = ("AntCircle", "CarCircle")
 SMALL_CRM = "3 x 128"
-"""On the noise that critics make, 2% less exact than the paper's model: `results/reconstruction.csv`."""
+"""Layers of a smaller reconstruction model. On the noise that critics make it is 2% less exact than the
+paper's: `data/results/reconstruction.csv`."""
 
 
 def groups() -> dict[str, list[Case]]:
-    """All that `python -m benchmarks --full` measures on one process; within a group everything is comparable."""
+    """Everything that `python -m benchmarks --full` measures in one process, by group.
+
+    Cases are compared within a group only.
+    """
     ant, car = TASKS
     product = [Case(PRODUCT, ant), Case(PRODUCT, ant, products="default")]
 
-    def yardsticks(task):
+    def yardsticks(task: str) -> list[Case]:
         ours = [Case("C2IQL", task), Case("C2IQL", task, products="default")]
         ours += [Case("C2IQL", task, crm=SMALL_CRM), Case("C2IQL", task, products="bfloat16")]
         ours += [Case("C2IQL", task, crm=SMALL_CRM, products="bfloat16")]
@@ -58,8 +61,8 @@ def groups() -> dict[str, list[Case]]:
     }
 
 
-def stopwatch(case: Case, device="cpu"):
-    """What times this case. ValueError for a peer that is not installed."""
+def stopwatch(case: Case, device: Device = "cpu") -> Peer | Steps | OurUpdates:
+    """What times this case. Raises ValueError for a peer that is not installed."""
     if case.what in PEERS:
         return Peer(case, device)
     return Steps(case, device) if case.what in (EAGER, PRODUCT) else OurUpdates(case, device)
@@ -69,14 +72,14 @@ def measure(
     cases: Sequence[Case],
     rounds: int = 3,
     seconds: float = 0.6,
-    device="cpu",
+    device: Device = "cpu",
     done: Callable[[], object] = lambda: None,
     missing: Callable[[str], object] = print,
 ) -> pd.DataFrame:
-    """One row per case and round: the case, the round, FLOP and seconds per update, and of each part.
+    """One row per case and round: the case, the round, FLOP per update, seconds per update and per part.
 
-    A measurement lasts `seconds` or one update, on a GPU twice that. What cannot be measured is left out, and
-    `missing` told why.
+    A measurement lasts `seconds` or one update, on a GPU twice that. A case that cannot be measured is left
+    out, and `missing` is called with the reason.
     """
     watches = {}
     for case in cases:
@@ -97,19 +100,22 @@ def measure(
 
 
 def side_by_side(case: Case, most: int, rounds: int = 3, seconds: float = 2.0) -> pd.DataFrame:
-    """One row per number of processes, up to `most`, and round: seconds per update of them all, by the clock.
+    """One row per number of processes, 1 and `most`, and round: seconds per update of them all, by the clock.
 
-    One thread each. Where other work keeps the cores busy this says nothing of the code.
+    Each process has one thread. Where other work keeps the cores busy, this says nothing about the code.
     """
-    rows, fresh = [], get_context("spawn")  # a single one, too, is a process of its own
-    with contextlib.ExitStack() as stack:
-        pools = {n: stack.enter_context(ProcessPoolExecutor(n, mp_context=fresh)) for n in (1, most)}
-        for turn in range(rounds + 1):
-            for count, pool in pools.items():
-                together = sum(pool.map(_rate, [case] * count, [seconds if turn else 0] * count))
+    rows = []
+    with joblib.Parallel(
+        n_jobs=max(most, 2), batch_size=1
+    ) as pool:  # two: one job is in a process of its own
+        for turn in range(rounds + 1):  # the first turn is a warm-up
+            for count in (1, most):
+                jobs = [joblib.delayed(_rate)(case, seconds if turn else 0)] * count
+                together = sum(pool(jobs))
                 if turn:
                     row = asdict(case) | {"batch": case.config.batch_size, "processes": count, "round": turn}
                     rows.append(row | {"seconds": 1 / together})
+    get_reusable_executor().shutdown()  # what follows begins with fresh processes
     return pd.DataFrame(rows)
 
 

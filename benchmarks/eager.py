@@ -1,7 +1,8 @@
-"""C2IQL as one would write it down first: a network each, an optimiser each, a loop over both critics.
+"""C2IQL as one would write it down first: one module and one optimiser per network, a loop over the critics.
 
-The yardstick for the speed of the library's, and an oracle for its updates: it shares no code with it.
-Profile `paper` only, one run: the zero penalty, cost heads scaled by 1 - gamma^T, a threshold per transition.
+The library's speed is compared with this version's, and its updates are tested against it: the two share no
+code. It knows profile `paper` and one run only: the zero penalty, cost heads that are scaled by 1 - gamma^T,
+and one threshold per transition.
 """
 
 import copy
@@ -9,56 +10,65 @@ import math
 
 import torch
 import torch.nn.functional as F
-from torch import nn
+from torch import Tensor, nn
+
+from tutorial_lib.agents.c2iql import C2IQLConfig
+from tutorial_lib.data.dataset import Batch
+from tutorial_lib.tasks import Task
 
 
 def network(inputs: int, width: int, layers: int, outputs: int) -> nn.Sequential:
+    """`layers` hidden layers of `width` ReLU units, and a linear output."""
     sizes = [inputs] + layers * [width]
-    net = []
+    net: list[nn.Module] = []
     for a, b in zip(sizes[:-1], sizes[1:], strict=True):
         net += [nn.Linear(a, b), nn.ReLU()]
     return nn.Sequential(*net, nn.Linear(sizes[-1], outputs))
 
 
 class EagerC2IQL:
-    """One run of Algorithm 2. Networks are read as scale (1 + output), as the library's are."""
+    """One run of Algorithm 2. The output o of a network is read as scale (1 + o), as in the library."""
 
-    def __init__(self, task, config, device="cpu"):
+    def __init__(self, task: Task, config: C2IQLConfig, device: torch.device | str = "cpu"):
         if config.unsafe_price is not None or config.recorded_step or config.time_limits != "rate":
             raise ValueError("the plain version knows the zero penalty and time_limits='rate' only")
         self.task, self.config, self.updates = task, config, 0
         obs, act, m = task.obs_dim + 1, task.act_dim, len(task.gammas)
         size = config.hidden_width, config.hidden_layers
-        self.nets = {"value": [network(obs, *size, 1)], "cost_value": [network(obs, *size, m)]}
-        self.nets["critics"] = [network(obs + act, *size, 1) for _ in range(2)]
-        self.nets["cost_critics"] = [network(obs + act, *size, m) for _ in range(config.cost_critics)]
-        self.nets["policy"] = [network(obs, *size, act)]
-        self.nets = {name: nn.ModuleList(nets).to(device) for name, nets in self.nets.items()}
+        nets = {"value": [network(obs, *size, 1)], "cost_value": [network(obs, *size, m)]}
+        nets["critics"] = [network(obs + act, *size, 1) for _ in range(2)]
+        nets["cost_critics"] = [network(obs + act, *size, m) for _ in range(config.cost_critics)]
+        nets["policy"] = [network(obs, *size, act)]
+        self.nets = {name: nn.ModuleList(members).to(device) for name, members in nets.items()}
         self.log_std = nn.Parameter(torch.zeros(act, device=device))
         self.targets = {name: copy.deepcopy(self.nets[name]) for name in ("critics", "cost_critics")}
         self.crm = network(m, config.crm_width, config.crm_layers, 1).requires_grad_(False).to(device)
         self.crm_mean, self.crm_whiten = torch.zeros(m, device=device), torch.eye(m, device=device)
         rates = {"value": config.value_lr, "cost_value": config.value_lr, "policy": config.policy_lr}
         self.optimisers = {}
-        for name, nets in self.nets.items():
-            parameters = [*nets.parameters(), *([self.log_std] if name == "policy" else [])]
+        for name, members in self.nets.items():
+            parameters = [*members.parameters(), *([self.log_std] if name == "policy" else [])]
             self.optimisers[name] = torch.optim.Adam(parameters, lr=rates.get(name, config.critic_lr))
         self.gammas = torch.tensor(task.gammas, device=device)
         self.scale = task.max_return / task.horizon / 2 / (1 - config.gamma)
         self.cost_scale = task.thresholds[1] / task.horizon / (1 - self.gammas)
         self.mean, self.std = (f(task.obs_dim, device=device) for f in (torch.zeros, torch.ones))
 
-    def see(self, observations, limits):
+    def network_input(self, observations: Tensor, limits: Tensor) -> Tensor:
+        """What the networks see: observations (B, obs) and limits (B,) as (B, obs + 1)."""
         code = torch.where(torch.isinf(limits), torch.tensor(1.5), limits / self.task.cost_range)
         return torch.cat([(observations - self.mean) / self.std, code[:, None]], dim=1)
 
-    def reconstruct(self, q_cost):
+    def reconstruct(self, q_cost: Tensor) -> Tensor:
+        """Lines 6 to 8: discounted costs (B, m) as the cost of an episode (B,)."""
         x = q_cost * (1 - self.gammas**self.task.horizon)
         return self.crm((x - self.crm_mean) @ self.crm_whiten)[:, 0] * self.task.horizon
 
-    def losses(self, batch, limits):
+    def losses(self, batch: Batch, limits: Tensor) -> dict[str, Tensor]:
+        """The losses of Algorithm 2, by network."""
         c, a = self.config, batch.actions
-        s, s_next = self.see(batch.observations, limits), self.see(batch.next_observations, limits)
+        s = self.network_input(batch.observations, limits)
+        s_next = self.network_input(batch.next_observations, limits)
         sa = torch.cat([s, a], dim=1)
         with torch.no_grad():  # lines 6 to 10, and the targets of lines 15 to 18
             q_costs = [self.cost_scale * (1 + net(sa)) for net in self.targets["cost_critics"]]
@@ -96,10 +106,10 @@ class EagerC2IQL:
             "policy": -((c.kappa_2 - negative).abs() * density.sum(1)).mean(),
         }
 
-    def update(self, batch, limits) -> dict[str, float]:
+    def update(self, batch: Batch, limits: Tensor) -> dict[str, float]:
         """One step of every network on B transitions and their limits (B,). Returns the losses."""
         c, losses = self.config, self.losses(batch, limits)
-        cosine = 0.5 * (1 + math.cos(math.pi * self.updates / c.steps))
+        cosine = 0.5 * (1 + math.cos(math.pi * self.updates / c.updates))
         self.optimisers["policy"].param_groups[0]["lr"] = c.policy_lr * cosine
         for name, loss in losses.items():
             self.optimisers[name].zero_grad()

@@ -1,6 +1,8 @@
-"""Speed: who makes how many updates, and what several seeds at once cost."""
+"""The figure of speed: updates per second of each library, and the cost of seeds that train together."""
 
 import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
 
 from benchmarks.cases import TASKS
 from benchmarks.peers import PEERS
@@ -14,8 +16,8 @@ PEER = "#E69F00"
 
 @or_not_run
 @one_figure
-def speed(updates):
-    """Raw rows of `python -m benchmarks --full`: updates per second of each contestant; cost as seeds are added."""
+def speed(updates: pd.DataFrame) -> Figure:
+    """From the raw rows of `python -m benchmarks --full`."""
     figure, (left, right) = subplots(1, 2, figsize=(12, 5.5), width_ratios=(3, 2))
     part = updates[updates["group"] == f"yardsticks {TASKS[0]}"]
     rates = {name: 1 / seconds(part, **case_of(name)).median() for name in NAMES}

@@ -10,15 +10,15 @@ from tutorial_lib.studies.report import ROOT, between_marks, drawn, markdown
 
 
 def speed_front() -> str:
-    """What was aimed at for the speed of training, and what was found."""
+    """The aims for the speed of training, and what was measured: the table of README.md."""
     updates = tables.load("updates")
     return tables.NOT_RUN if updates is None else markdown(tables.marks(updates))
 
 
 def speed_text() -> str:
-    """Everything that `python -m benchmarks --full` measured, and where."""
+    """Everything that `python -m benchmarks --full` measured, and on which machine, for data/README.md."""
     updates, simulation, machine = (tables.load(name) for name in ("updates", "simulation", "machine"))
-    if updates is None:
+    if updates is None or machine is None:
         return tables.NOT_RUN
     made = (tables.yardsticks, tables.by_algorithm, tables.by_precision, tables.by_part, tables.growth)
     parts = [tables.circumstances(machine), "![speed](results/bench/speed.png)"]

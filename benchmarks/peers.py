@@ -1,8 +1,9 @@
-"""Other libraries' updates, timed in a process of their own that sees packages which the course does not.
+"""Updates of other libraries, the peers, timed in a process of their own.
 
-Peers share our PyTorch, so that they could multiply as fast as we do; everything else of theirs comes from a
-folder. Each is given one ready-made batch again and again: sampling is not counted, unlike for ours. They
-have the paper's widths and batch; all else is as their own examples have it.
+That process sees packages which the project does not install. The peers use the project's PyTorch, and
+everything else comes from a folder of their own. Each one gets the same batch again and again, so sampling
+is not part of its time, while it is part of ours. They have the paper's widths and batch size; all other
+options are those of their own examples.
 """
 
 import functools
@@ -11,26 +12,29 @@ import os
 import subprocess
 import sys
 import types
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
-from benchmarks.updates import Case, flop_of, random_transitions, timed
-from tutorial_lib.tasks import get_task
+from benchmarks.updates import Case, Device, flop_of, random_transitions, timed
+from tutorial_lib.config import Config
+from tutorial_lib.tasks import Task, get_task
 
 FOLDER = Path("runs/bench/peers")
 PACKAGES = (
     "osrl-lib==0.1.0",
     "d3rlpy==2.8.1",
-    # What d3rlpy asks for and the course does not have. (OSRL's own list pins an old PyTorch: not installed.)
+    # What d3rlpy needs and the project does not have. Of what OSRL lists nothing is: it pins an old PyTorch.
     *("gym==0.26.2", "gym_notices", "structlog", "colorama", "dataclasses-json", "marshmallow"),
     *("typing-inspect", "mypy-extensions", "scikit-learn", "narwhals", "threadpoolctl"),
 )
 
 
 def install(folder: Path = FOLDER) -> None:
-    """Put the peers into a folder with pip: 60 MB. Raises ValueError with pip's last line where it fails."""
+    """Install the peers into a folder with pip, 60 MB. Raises ValueError with pip's last line if it fails."""
     command = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--upgrade"]
     done = subprocess.run([*command, "--target", folder, *PACKAGES], capture_output=True, text=True)
     if done.returncode:
@@ -41,7 +45,7 @@ def install(folder: Path = FOLDER) -> None:
 class Peer:
     """Times a peer's updates. Raises ValueError, with the reason, where it does not run."""
 
-    def __init__(self, case: Case, device="cpu", folder: Path = FOLDER):
+    def __init__(self, case: Case, device: Device = "cpu", folder: Path = FOLDER):
         self.asked = {"what": case.what, "task": case.task, "profile": case.profile, "device": str(device)}
         self.process = _process(Path(folder).absolute())
         self.flop = self._ask(0)["flop"]
@@ -50,10 +54,12 @@ class Peer:
         """Seconds per update."""
         return {"seconds": self._ask(seconds)["seconds"]}
 
-    def _ask(self, seconds: float) -> dict:
+    def _ask(self, seconds: float) -> dict[str, float]:
+        pipes = self.process.stdin, self.process.stdout
+        assert pipes[0] and pipes[1]  # _process opened both
         try:
-            print(json.dumps(self.asked | {"seconds": seconds}), file=self.process.stdin, flush=True)
-            answer = json.loads(self.process.stdout.readline() or '{"error": "its process died"}')
+            print(json.dumps(self.asked | {"seconds": seconds}), file=pipes[0], flush=True)
+            answer = json.loads(pipes[1].readline() or '{"error": "its process died"}')
         except BrokenPipeError:
             answer = {"error": "its process died"}
         if "error" in answer:
@@ -80,20 +86,27 @@ def _process(folder: Path) -> subprocess.Popen:
 # --- In the peers' process ---
 
 
-def osrl(name: str, task, config, device: str):
+def osrl(name: str, task: Task, config: Config, device: str) -> Callable[[], object]:
     """OSRL's CPQ or BCQ-Lag: its trainer's step, without a logger."""
 
     class Logger:
-        def store(self, **scalars):
+        def store(self, **scalars: object) -> None:
             pass
 
-    loggers = types.ModuleType("fsrl.utils")  # all that OSRL takes from that package, which brings much else
-    loggers.DummyLogger = loggers.WandbLogger = Logger
+    loggers = types.ModuleType(
+        "fsrl.utils"
+    )  # OSRL uses nothing else of that package, which needs many others
+    vars(loggers).update(DummyLogger=Logger, WandbLogger=Logger)
     sys.modules |= {"fsrl": types.ModuleType("fsrl"), "fsrl.utils": loggers}
     from osrl import algorithms
 
     widths = config.hidden_layers * [config.hidden_width]
-    sizes = {"a_hidden_sizes": widths, "c_hidden_sizes": widths, "vae_hidden_sizes": 400, "beta": 0.5}
+    sizes: dict[str, object] = {
+        "a_hidden_sizes": widths,
+        "c_hidden_sizes": widths,
+        "vae_hidden_sizes": 400,
+        "beta": 0.5,
+    }
     if name == "CPQ":
         sizes |= {"num_q": 2, "num_qc": 2}  # BCQ-Lag's are pairs already
     options = sizes | {"episode_len": task.horizon, "device": device}
@@ -104,8 +117,8 @@ def osrl(name: str, task, config, device: str):
     return lambda: trainer.train_one_step(*batch)
 
 
-def d3rlpy(task, config, device: str):
-    """d3rlpy's IQL: its update, from NumPy as in its own loop."""
+def d3rlpy(task: Task, config: Config, device: str) -> Callable[[], object]:
+    """d3rlpy's IQL: its update, on a batch of NumPy arrays as in its own loop."""
     from d3rlpy.algos import IQLConfig
     from d3rlpy.dataset import TransitionMiniBatch
     from d3rlpy.models.encoders import VectorEncoderFactory
@@ -122,7 +135,7 @@ def d3rlpy(task, config, device: str):
     return lambda: algorithm.update(batch)
 
 
-PEERS = {
+PEERS: dict[str, Callable[..., Callable[[], object]]] = {
     "OSRL's CPQ": functools.partial(osrl, "CPQ"),
     "OSRL's BCQ-Lag": functools.partial(osrl, "BCQL"),
     "d3rlpy's IQL": d3rlpy,
@@ -130,20 +143,20 @@ PEERS = {
 
 
 @functools.cache
-def _step(what: str, task: str, profile: str, device: str):
+def _step(what: str, task: str, profile: str, device: str) -> tuple[Callable[[], object], float]:
     step = PEERS[what](get_task(task), Case(what, task, profile).config, device)
     return step, flop_of(step)
 
 
 def main() -> None:
-    """A line of JSON in, one out: what to time and for how long; FLOP and seconds per update, or why not."""
-    answers, sys.stdout = sys.stdout, sys.stderr  # what a peer prints is no answer
+    """Read lines of JSON, what to time and for how long; answer each with FLOP and seconds, or an error."""
+    answers, sys.stdout = sys.stdout, sys.stderr  # a peer may print, and that is no answer
     for line in sys.stdin:
         asked = json.loads(line)
         seconds = asked.pop("seconds")
         try:
             step, flop = _step(**asked)
-            answer = {"flop": flop, "seconds": timed(step, seconds, asked["device"])}
+            answer: dict[str, Any] = {"flop": flop, "seconds": timed(step, seconds, asked["device"])}
         except Exception as error:  # whatever a peer stumbles over
             answer = {"error": f"{type(error).__name__}: {' '.join(str(error).split())}"}
         print(json.dumps(answer), file=answers, flush=True)

@@ -1,8 +1,9 @@
-"""How fast episodes are played: by `c2iql evaluate`, and by the bare simulator with the same actions."""
+"""How fast `c2iql evaluate` plays episodes, compared with the bare simulator and the same actions."""
 
 import functools
 import time
 from collections.abc import Callable
+from typing import Any
 
 import joblib
 import numpy as np
@@ -10,38 +11,38 @@ import pandas as pd
 from joblib.externals.loky import get_reusable_executor
 
 from tutorial_lib import playing
-from tutorial_lib.agents import get_algorithm
-from tutorial_lib.config import get_profile
+from tutorial_lib.agents.c2iql import C2IQL
 from tutorial_lib.tasks import Task, make_env
 
 
 def simulation(
     task: Task, workers: int, rounds: int = 3, done: Callable[[], object] = lambda: None
 ) -> pd.DataFrame:
-    """One row per way to step: processes, steps per second, and the share of bare simulator x processes.
+    """One row per way to play: processes, steps per second, and the share of bare simulator x processes.
 
-    Bare simulator and our environment play the same actions, those of the rollouts' policy, in whole episodes
-    with their resets.
+    The bare simulator and our environment play the actions of the rollouts' policy, in whole episodes with
+    their resets.
     """
-    agent = get_algorithm("C2IQL")(task, get_profile("small"))
+    agent = C2IQL(task, C2IQL.configure("small"))
     actions = _actions(agent)
     cases = {
         ("bare simulator", 1): lambda: _play("bare", task.name, actions),
         ("our environment", 1): lambda: _play("ours", task.name, actions),
         ("rollouts", 1): lambda: _rollouts(agent, 1),
         ("bare simulator", workers): lambda: _play_beside("bare", task.name, actions, workers),
-        # Played first, as joblib replaces processes that come to need much more memory than at first.
+        # The warm-up plays this first, because it needs the most memory: joblib replaces processes whose memory
+        # has grown much since their first job.
         ("rollouts", workers): lambda: _rollouts(agent, workers),
     }
     speeds = np.zeros((rounds + 1, len(cases)))
-    for turn in range(rounds + 1):  # the first, backwards, warms up: processes start, simulators are built
+    for turn in range(rounds + 1):  # the first, backwards, is a warm-up: it starts processes and simulators
         order = list(enumerate(cases.values()))
         for column, case in order if turn % 2 else reversed(order):
             started = time.perf_counter()
             steps = case()
             speeds[turn, column] = steps / (time.perf_counter() - started)
             done()
-    get_reusable_executor().shutdown()  # the next task's processes begin without this one's simulators
+    get_reusable_executor().shutdown()  # the next task begins with fresh processes
     rows = []
     for (what, processes), speed in zip(cases, speeds[1:].T, strict=True):
         row = {"what": what, "processes": processes, "steps_per_second": np.median(speed)}
@@ -49,20 +50,30 @@ def simulation(
     return pd.DataFrame(rows)
 
 
-def _actions(agent) -> np.ndarray:
-    """What the policy does in the first episodes: (T, E, act)."""
-    taken, act = [], agent.act
-    agent.act = lambda *inputs: taken.append(act(*inputs)) or taken[-1]
-    playing.rollout(agent, agent.task.thresholds[0], range(playing.EPISODES_TOGETHER))
-    del agent.act
-    return np.stack(taken)
+class Recorder(C2IQL):
+    """An agent that keeps the actions that it takes."""
+
+    def __init__(self, *args: Any, **kwargs: Any):
+        super().__init__(*args, **kwargs)
+        self.taken: list[np.ndarray] = []
+
+    def act(self, *args: Any, **kwargs: Any) -> np.ndarray:
+        self.taken.append(super().act(*args, **kwargs))
+        return self.taken[-1]
+
+
+def _actions(agent: C2IQL) -> np.ndarray:
+    """The actions of the untrained agent in its first episodes: (T, E, act)."""
+    recorder = Recorder(agent.task, agent.config, agent.seeds)
+    playing.rollout(recorder, agent.task.thresholds[0], range(playing.EPISODES_TOGETHER))
+    return np.stack(recorder.taken)
 
 
 def _play(kind: str, task_name: str, actions: np.ndarray) -> int:
-    """Play every episode of `actions` (T, E, act), one after the other; returns the number of steps."""
+    """Play every episode of `actions` (T, E, act), one after the other. Returns the number of steps."""
     env = _environment(kind, task_name)
     for seed in range(actions.shape[1]):
-        np.random.seed(seed)  # all that the bare simulator heeds
+        np.random.seed(seed)  # the bare simulator ignores the seed of reset
         env.reset(seed=seed)
         for action in actions[:, seed]:
             env.step(action)
@@ -70,19 +81,19 @@ def _play(kind: str, task_name: str, actions: np.ndarray) -> int:
 
 
 def _play_beside(kind: str, task_name: str, actions: np.ndarray, workers: int) -> int:
-    """`_play` in several processes at once: what the machine gives when its cores are shared."""
+    """`_play` in several processes at once, which share the machine."""
     jobs = [joblib.delayed(_play)(kind, task_name, actions)] * workers
     return sum(joblib.Parallel(n_jobs=workers)(jobs))
 
 
 @functools.lru_cache
-def _environment(kind: str, task_name: str):
-    """Each process keeps its own. The bare simulator is what gymnasium.make gives, without its wrappers."""
+def _environment(kind: str, task_name: str) -> Any:
+    """A process makes one and keeps it. The bare simulator is what gymnasium.make gives, without wrappers."""
     env = make_env(task_name)
     return env if kind == "ours" else env._sim
 
 
-def _rollouts(agent, workers: int) -> int:
-    """As `c2iql evaluate` does it, one job for each worker; returns the number of steps."""
+def _rollouts(agent: C2IQL, workers: int) -> int:
+    """Play as `c2iql evaluate` does, one job for each worker. Returns the number of steps."""
     episodes = playing.EPISODES_TOGETHER * workers
     return int(playing.evaluate(agent, agent.task.thresholds[:1], episodes, workers)["length"].sum())

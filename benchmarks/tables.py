@@ -15,7 +15,7 @@ FILES = {name: f"{name}.csv" for name in ("machine", "updates", "simulation")}
 NOT_RUN = "*Not measured: `python -m benchmarks --full` does it.*"
 OURS, SMALL = "C2IQL", f"C2IQL, its reconstruction model {SMALL_CRM}"
 ROUNDED, BOTH = "C2IQL in bfloat16", f"C2IQL in bfloat16, its reconstruction model {SMALL_CRM}"
-NAMES = {  # what stands in the table: (what, products, crm)
+NAMES = {  # of a row in the table: (what, products, crm)
     "C2IQL": (OURS, "float32", "5 x 512"),
     SMALL: (OURS, "float32", SMALL_CRM),
     ROUNDED: (OURS, "bfloat16", "5 x 512"),
@@ -36,7 +36,7 @@ def load(name: str, folder: Path | None = None) -> pd.DataFrame | None:
 
 
 def with_shares(updates: pd.DataFrame) -> pd.DataFrame:
-    """With `share`: arithmetic per second against that of one large float32 product in the same round."""
+    """With `share`: arithmetic per second over that of one large float32 product in the same round."""
     product = updates[(updates["what"] == PRODUCT) & (updates["products"] == "float32")]
     rate = (product["flop"] / product["seconds"]).set_axis(product["round"])
     return updates.assign(share=updates["flop"] / updates["seconds"] / updates["round"].map(rate))
@@ -48,7 +48,7 @@ def part_shares(updates: pd.DataFrame) -> pd.DataFrame:
     return parts.div(parts.sum(axis=1), axis=0)
 
 
-def seconds(updates: pd.DataFrame, **case) -> pd.Series:
+def seconds(updates: pd.DataFrame, **case: object) -> pd.Series:
     """Seconds per update of one case, by round; empty where it was not measured."""
     return _select(updates, case).set_index("round")["seconds"]
 
@@ -64,7 +64,7 @@ def ratios(updates: pd.DataFrame, slow: dict, fast: dict) -> pd.Series:
 
 
 def yardsticks(updates: pd.DataFrame) -> pd.DataFrame:
-    """One row per contestant, profile `paper`: updates per second, share of the product's rate, x plain."""
+    """One row per entry of `NAMES`, profile `paper`: updates per second, share, ratio to the plain one."""
     rows = []
     parts = {task: with_shares(updates[updates["group"] == f"yardsticks {task}"]) for task in TASKS}
     for name in NAMES:
@@ -85,7 +85,7 @@ def yardsticks(updates: pd.DataFrame) -> pd.DataFrame:
 
 
 def marks(updates: pd.DataFrame) -> pd.DataFrame:
-    """What was aimed at, and what was found in one run: ratios, median (lowest to highest) over rounds."""
+    """The aims, and what one run found: ratios, as median (lowest to highest) over its rounds."""
     ours, small, plain, peer = map(case_of, (OURS, SMALL, EAGER, "OSRL's CPQ"))
     aims = {
         "arithmetic, against that of one large product": ("0.8", None),
@@ -138,7 +138,7 @@ def by_precision(updates: pd.DataFrame) -> pd.DataFrame:
 
 
 def by_part(updates: pd.DataFrame) -> pd.DataFrame:
-    """Where an update's time goes: the parts' shares, by profile and number of seeds."""
+    """The share of each part in the time of an update, by profile and number of seeds."""
     part = updates[updates["group"] == "seeds"]
     shares = part_shares(part).groupby([part["profile"], part["runs"]], sort=False)
     table = shares.median().map("{:.0%}".format).reset_index()
@@ -146,9 +146,9 @@ def by_part(updates: pd.DataFrame) -> pd.DataFrame:
 
 
 def growth(updates: pd.DataFrame) -> pd.DataFrame:
-    """Milliseconds per update as seeds, batch, dataset or tasks grow, and the multiple of the first.
+    """Milliseconds per update as seeds, batch, dataset or tasks grow, and the ratio of last to first.
 
-    Tasks are trained one after the other: their sum counts, as a multiple of the largest's, AntCircle's.
+    Tasks are trained one after the other. Of them it is the ratio of the sum to the largest, AntCircle.
     """
     rows = []
     for group, column in (("seeds", "runs"), ("batch", "batch"), ("rows", "rows")):
@@ -170,7 +170,7 @@ def growth(updates: pd.DataFrame) -> pd.DataFrame:
 
 
 def rollouts(simulation: pd.DataFrame) -> pd.DataFrame:
-    """Seconds per evaluation episode, and the speed against the bare simulator's."""
+    """Seconds per evaluation episode, and the speed as a share of the bare simulator's."""
     table = simulation.assign(horizon=simulation["task"].map(lambda name: get_task(name).horizon))
     table["s per episode"] = (table["horizon"] / table["steps_per_second"]).map("{:.3f}".format)
     table["of the bare simulator"] = table["of_bare"].map("{:.0%}".format)

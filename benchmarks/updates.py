@@ -1,23 +1,32 @@
-"""Times what one update takes, ours by its parts. What data hold does not matter, so they are random."""
+"""Times what one update takes, and for the library's algorithms each of its parts.
+
+The time does not depend on the values of the data, so the data are random.
+"""
 
 import contextlib
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
 from benchmarks.eager import EagerC2IQL
-from tutorial_lib.agents import get_algorithm
-from tutorial_lib.config import Config, get_profile
-from tutorial_lib.data.dataset import Batch, sample_batch
+from tutorial_lib.agents import ALGORITHMS
+from tutorial_lib.agents.c2iql import C2IQL, C2IQLConfig
+from tutorial_lib.config import Config
+from tutorial_lib.costs.reconstruction import ReconstructionConfig
+from tutorial_lib.data.dataset import Batch
 from tutorial_lib.matmul import products
 from tutorial_lib.tasks import Task, get_task
 
+Device = torch.device | str
 PARTS = ("sampling", "reconstruction", "networks", "backward", "optimiser")
-"""The parts of an update: batch and limits; the cost reconstruction model; the other networks and the
-losses, forward; gradients; Adam's step with the learning rate, and the target networks."""
+"""The parts of an update: everything random (`Agent.draw_all`); the cost reconstruction
+model; the other networks and the losses; their gradients, with the learning rates and the clipping; Adam's
+step, the target networks and the variables."""
 PRODUCT, EAGER = "a product of 1024 x 1024", "plain eager C2IQL"
 PRODUCT_SIZE = 1024
 
@@ -44,26 +53,28 @@ class Case:
 
     @property
     def config(self) -> Config:
-        config = get_profile(self.profile)
+        """The options of the algorithm; C2IQL's for what is not an algorithm of the library."""
+        config = ALGORITHMS.get(self.what, C2IQL).configure(self.profile)
+        changes: dict[str, Any] = {}
         if self.products == "bfloat16":
-            config = replace(config, precision="bfloat16")
-        if self.profile == "paper":
-            layers, width = map(int, self.crm.split(" x "))
-            config = replace(config, crm_layers=layers, crm_width=width)
-        return config if self.batch is None else replace(config, batch_size=self.batch)
+            changes["precision"] = "bfloat16"
+        if self.profile == "paper" and isinstance(config, ReconstructionConfig):
+            changes["crm_layers"], changes["crm_width"] = map(int, self.crm.split(" x "))
+        if self.batch is not None:
+            changes["batch_size"] = self.batch
+        return config.changed(**changes)
 
 
-def clock(device="cpu") -> Callable[[], float]:
-    """The processor's time where one thread does the work, so that what else runs counts less; else
-    the wall's.
+def clock(device: Device = "cpu") -> Callable[[], float]:
+    """The processor's time where one thread does the work, else the time on the wall.
 
-    (On a busy machine caches and memory are still shared.)
+    Other programs disturb the processor's time less. (Caches and memory are still shared with them.)
     """
     alone = torch.device(device).type == "cpu" and torch.get_num_threads() == 1
     return time.thread_time if alone else time.perf_counter
 
 
-def timed(step: Callable[[], object], seconds: float, device="cpu") -> float:
+def timed(step: Callable[[], object], seconds: float, device: Device = "cpu") -> float:
     """Seconds per call of `step`, over as many as fit, at least one. A GPU is fed ahead, as in training."""
     now, calls = clock(device), 0
     _wait_for(device)
@@ -83,29 +94,26 @@ def flop_of(step: Callable[[], object]) -> float:
 
 
 class OurUpdates:
-    """Times the updates of one agent by laps: everything since the last lap is charged to one part."""
+    """Times the updates of one agent by laps: the time since the last lap is charged to one part."""
 
-    def __init__(self, case: Case, device="cpu"):
-        kind, task = get_algorithm(case.what), get_task(case.task)
-        threshold = task.thresholds[1] if kind.constrained and not kind.conditioned else None
-        agent = kind(task, case.config, seeds=range(case.runs), threshold=threshold, device=device)
-        self.agent, self.device = agent, torch.device(device)
-        self.products = _setting(case.products)
-        self.data = random_transitions(task, case.rows, device)
-        self.generators = [torch.Generator().manual_seed(seed) for seed in agent.seeds]
-        self.now, self.last, self.lapping = clock(device), None, True
+    def __init__(self, case: Case, device: Device = "cpu"):
+        kind, task = ALGORITHMS[case.what], get_task(case.task)
+        limits = task.typical_limit if kind.needs_limit else None
+        self.agent = kind(task, case.config, seeds=range(case.runs), limits=limits, device=device)
+        self.device, self.products = torch.device(device), _setting(case.products)
+        self.data = [random_transitions(task, case.rows, device)] * case.runs
+        self.generators = [torch.Generator().manual_seed(seed) for seed in self.agent.seeds]
+        self.now, self.lapping = clock(device), True
+        self.last: float | None = None
         self.laps = dict.fromkeys(PARTS, 0.0)
         self.flop = flop_of(self._update)
-        agent._total = self._around(agent._total, "sampling", "networks")
-        if hasattr(agent, "reconstruction"):
-            model = agent.reconstruction
-            model.forward = self._around(model.forward, "networks", "reconstruction")
-        agent.optimiser.step = self._around(agent.optimiser.step, "backward", "optimiser")
+        self._mark_laps()
 
     def measure(self, seconds: float) -> dict[str, float]:
         """Seconds per update, in all and of each part, over as many updates as fit.
 
-        Every lap waits for a GPU, which training does not: there the whole is timed once more, without laps.
+        Every lap waits for a GPU, which training does not do: on a GPU the whole is timed once more, without
+        laps.
         """
         self.laps, updates, self.last = dict.fromkeys(PARTS, 0.0), 0, None
         with self.products():
@@ -122,20 +130,25 @@ class OurUpdates:
                 self.lapping = True
         return {"seconds": whole} | parts
 
-    def _update(self):
-        batch = sample_batch(self.data, self.agent.config.batch_size, self.generators)
-        self.agent.update(batch, self.generators)
+    def _update(self) -> None:
+        batch = self.agent.draw_all(self.data, self.generators)
+        self._lap("sampling")
+        self.agent.update(batch)
 
-    def _around(self, function, before: str, inside: str):
-        """The function, which charges the time until it is called to one part and its own to another."""
+    def _mark_laps(self) -> None:
+        """End laps where an update goes on to its next part: around the model, before and after gradients."""
+        if isinstance(self.agent, C2IQL) and self.agent.reconstructs:
+            self.agent.reconstruction.register_forward_pre_hook(lambda *_: self._lap("networks"))
+            self.agent.reconstruction.register_forward_hook(lambda *_: self._lap("reconstruction"))
+        adam = self.agent.adam
+        adam.register_step_pre_hook(lambda *_: self._lap("backward"))
+        clear = adam.zero_grad  # it is called between the losses and their gradients, and has no hook
 
-        def measured(*args, **kwargs):
-            self._lap(before)
-            result = function(*args, **kwargs)
-            self._lap(inside)
-            return result
+        def zero_grad(set_to_none: bool = True) -> None:
+            self._lap("networks")
+            clear(set_to_none)
 
-        return measured
+        adam.zero_grad = zero_grad  # type: ignore[method-assign]
 
     def _lap(self, part: str) -> None:
         if not self.lapping:
@@ -150,7 +163,7 @@ class OurUpdates:
 class Steps:
     """Times calls of a function: the plain version's updates, or a matrix product."""
 
-    def __init__(self, case: Case, device="cpu"):
+    def __init__(self, case: Case, device: Device = "cpu"):
         self.device, self.products = device, _setting(case.products)
         self.step = _product(device) if case.what == PRODUCT else _eager_updates(case, device)
         self.flop = flop_of(self.step)
@@ -161,22 +174,23 @@ class Steps:
             return {"seconds": timed(self.step, seconds, self.device)}
 
 
-def _setting(name: str) -> Callable:
+def _setting(name: str) -> Callable[[], AbstractContextManager]:
     return contextlib.nullcontext if name == "default" else products
 
 
-def _product(device) -> Callable[[], object]:
+def _product(device: Device) -> Callable[[], object]:
     a, b = torch.ones(2, PRODUCT_SIZE, PRODUCT_SIZE, device=device)
     out = torch.empty_like(a)
     return lambda: torch.mm(a, b, out=out)
 
 
-def _eager_updates(case: Case, device) -> Callable[[], object]:
+def _eager_updates(case: Case, device: Device) -> Callable[[], object]:
     task, config = get_task(case.task), case.config
+    assert isinstance(config, C2IQLConfig)
     agent, data = EagerC2IQL(task, config, device), random_transitions(task, case.rows, device)
     limits = torch.tensor([*task.thresholds, float("inf")], device=device)
 
-    def step():
+    def step() -> None:
         rows = torch.randint(case.rows, (config.batch_size,)).to(device)
         drawn = limits[torch.randint(len(limits), (config.batch_size,)).to(device)]
         agent.update(Batch(*(x[rows] for x in data)), drawn)
@@ -184,7 +198,7 @@ def _eager_updates(case: Case, device) -> Callable[[], object]:
     return step
 
 
-def random_transitions(task: Task, count: int, device="cpu") -> Batch:
+def random_transitions(task: Task, count: int, device: Device = "cpu") -> Batch:
     """`count` transitions of the task's sizes, with rewards and costs of about its scale."""
     generator = torch.Generator().manual_seed(0)
     shapes = [(count, task.obs_dim), (count, task.act_dim), (count,), (count,), (count, task.obs_dim)]
@@ -192,6 +206,6 @@ def random_transitions(task: Task, count: int, device="cpu") -> Batch:
     return Batch(*data, *torch.zeros(2, count, device=device))
 
 
-def _wait_for(device) -> None:
+def _wait_for(device: Device) -> None:
     if torch.device(device).type == "cuda":
         torch.cuda.synchronize(device)  # calls return before the device has done the work

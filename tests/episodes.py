@@ -38,13 +38,13 @@ def shared_env(name: str):
     return make_env(name)
 
 
-def play(env, seed: int, steps: int | None = None, actions_seed: int = 0) -> Episode:
-    """An episode, or its first steps, with random actions that are held for five steps each."""
+def play(env, seed: int, steps: int | None = None, actions_seed: int = 0, hold: int = 5) -> Episode:
+    """An episode, or its first steps, with random actions that are held for `hold` steps each."""
     rng = np.random.default_rng(actions_seed)
     observation, _ = env.reset(seed=seed)
     rows = [(observation, 0.0, 0.0, _position(env), False, False)]
     while len(rows) - 1 != steps:
-        if len(rows) % 5 == 1:
+        if (len(rows) - 1) % hold == 0:
             action = rng.uniform(-1, 1, env.task.act_dim)
         observation, reward, terminated, truncated, info = env.step(action)
         rows.append((observation, reward, info["cost"], _position(env), terminated, truncated))

@@ -12,9 +12,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-import benchmarks
 from tutorial_lib import __main__ as cli
-from tutorial_lib.__main__ import bench
 from tutorial_lib.checkpoints import load_agent
 from tutorial_lib.data.dataset import Dataset
 from tutorial_lib.data.hdf5 import write_dataset
@@ -78,7 +76,6 @@ def words(text):
         "evaluate": ["Run a trained agent in the simulator", "--thresholds", "per seed and threshold"],
         "report": ["Make tables and figures from the results' files", "whose table is printed"],
         "study": ["Run a study", "address of a dask scheduler", "--only", "steps=200"],
-        "bench": ["Measure this machine", "bare simulator's speed", "--workers"],
     }.items(),
 )
 def test_help_says_what_a_command_does(command, phrases, c2iql):
@@ -123,7 +120,6 @@ def test_it_runs_as_a_module():
         (["train", "BallRum"], "unknown task 'BallRum': did you mean BallRun"),
         (["fetch", "Hopper"], "unknown task 'Hopper'"),
         (["collect", "AntCircl"], "unknown task 'AntCircl': did you mean AntCircle"),
-        (["bench", "--task", "Ball"], "unknown task 'Ball'"),
         (["train", "BallRun", "--algorithm", "SAC"], "unknown algorithm 'SAC': the algorithms are IQL"),
         (["train", "BallRun", "--profile", "huge"], "unknown profile 'huge': the profiles are paper, small"),
         (["train", "BallRun", "--option", "kappa=0.7"], "--option kappa=0.7: write NAME=VALUE with one of"),
@@ -141,7 +137,6 @@ def test_it_runs_as_a_module():
         (["evaluate", "nowhere.safetensors", "--workers", "0"], "--workers 0: must be 1 or more"),
         (["evaluate", "nowhere.safetensors", "--out", "."], "--out .: is a folder: name a file"),
         (["study", "ablations", "--workers", "0"], "--workers 0: must be 1 or more"),
-        (["bench", "--rounds", "0"], "--rounds 0: must be 1 or more"),
         (["train", "BallRun", "--algorithm", "CIQL", "--threshold", "-3"], "must be zero or more, not -3.0"),
         (["train", "BallRun", "--algorithm", "CIQL"], "CIQL is trained for one threshold"),
         (["train", "BallRun", "--threshold", "30"], "C2IQL takes no threshold to train"),
@@ -158,9 +153,8 @@ def test_an_error_is_one_line(arguments, message, c2iql):
 
 def test_a_machine_without_cuda_says_so(c2iql, monkeypatch):
     monkeypatch.setattr(cli.torch.cuda, "is_available", lambda: False)
-    for command in (["train", "BallRun"], ["bench"]):
-        status, _, err = c2iql(*command, "--device", "cuda")
-        assert status == 1 and err.startswith("c2iql: --device cuda") and err.count("\n") == 1
+    status, _, err = c2iql("train", "BallRun", "--device", "cuda")
+    assert status == 1 and err.startswith("c2iql: --device cuda") and err.count("\n") == 1
 
 
 @pytest.mark.parametrize("arguments", [[], ["learn"], ["train"], ["train", "BallRun", "--colour", "red"]])
@@ -284,23 +278,6 @@ def test_a_folder_that_cannot_be_written_is_one_line_of_error(c2iql, data, tmp_p
     train = ["train", "BallRun", "--data", data, "--out", tmp_path / "file" / "run"]
     status, _, err = c2iql(*train, "--algorithm", "IQL", "--option", *TINY, "steps=1")
     assert status == 1 and "Traceback" not in err and err.splitlines()[-1].startswith("c2iql: ")
-
-
-def test_bench_prints_both_tables(c2iql, monkeypatch):
-    tiny = cli.with_options(cli.get_profile("small"), tuple(TINY))
-    monkeypatch.setattr(bench, "PROFILES", {"small": tiny})
-    monkeypatch.setattr(benchmarks.updates, "get_profile", lambda name: tiny)
-    status, out, err = c2iql("bench", "--task", "BallRun", "--rounds", 1, "--workers", 1)
-    assert status == 0, err
-    lines = [line.split() for line in out.splitlines()]
-    rows = [line for line in lines if line[:1] == ["small"]]
-    assert [row[1:3] for row in rows] == [["1", "float32"], ["3", "float32"], ["1", "bfloat16"]]
-    for row in rows:
-        shares = [int(cell.rstrip("%")) for cell in row[6:]]
-        assert len(shares) == len(benchmarks.PARTS) and 98 <= sum(shares) <= 102
-        assert float(row[3]) > 1
-    assert ["bare", "simulator", "1"] in [line[:3] for line in lines]
-    assert any(line[:2] == ["rollouts", "1"] and 0 < int(line[3].rstrip("%")) < 200 for line in lines)
 
 
 def test_options_that_fit_together_come_in_any_order():

@@ -47,7 +47,7 @@ def make_results(groups, seeds=(0, 1, 2), limits=(30, 50, 70), task="CarCircle",
 def test_the_averages_of_table_1_are_those_that_it_prints():
     assert TABLE1.keys() == TABLE1_AVERAGES.keys()
     for name, rows in TABLE1.items():
-        assert rows.keys() == TASKS.keys() == TABLE1_STD.keys()
+        assert rows.keys() == TABLE1_STD.keys() <= TASKS.keys()
         found = np.mean(list(rows.values()), axis=0)
         assert found == pytest.approx(TABLE1_AVERAGES[name], abs=0.008), name  # some cut off, not rounded
 

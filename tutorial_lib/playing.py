@@ -51,7 +51,8 @@ def rollout(agent: Agent, limits, seeds: Sequence[int], run: int = 0) -> Rollout
         for e in np.flatnonzero(alive):
             observations[e], rewards[t, e], terminated, _, info = envs[e].step(actions[e])
             costs[t, e] = info["cost"]
-            positions[t, e] = envs[e].position
+            if task.scene is not None:
+                positions[t, e] = envs[e].position
             if terminated:
                 alive[e], lengths[e] = False, t + 1
         player.see(rewards[t], costs[t])

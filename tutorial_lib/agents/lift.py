@@ -39,13 +39,14 @@ class Borrower:
         refuse_hidden_state(module)
         self.module = copy.deepcopy(module)
         self.places: list[Place] = []
-        first_name: dict[int, str] = {}  # a tensor that stands in two places is one parameter
+        first_name: dict[Tensor, str] = {}  # a tensor that stands in two places is one parameter
         for prefix, layer in self.module.named_modules():
             for own in (layer._parameters, layer._buffers):
                 for attribute in [key for key, tensor in own.items() if tensor is not None]:  # no bias: None
                     name = f"{prefix}.{attribute}" if prefix else attribute
-                    name = first_name.setdefault(id(own.pop(attribute)), name)
-                    self.places.append(Place(name, vars(layer), attribute))
+                    tensor = own.pop(attribute)
+                    assert tensor is not None
+                    self.places.append(Place(first_name.setdefault(tensor, name), vars(layer), attribute))
 
     def lend(self, tensors: Tensors) -> nn.Module:
         """The network with these tensors, by their names, until others are lent."""

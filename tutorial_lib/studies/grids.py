@@ -14,6 +14,7 @@ from tutorial_lib.agents import ALGORITHMS, get_algorithm
 from tutorial_lib.config import Config
 from tutorial_lib.data.dataset import DatasetError
 from tutorial_lib.data.sources import find_dataset, load_dataset
+from tutorial_lib.studies.paper import TABLE2
 from tutorial_lib.studies.runs import Runs
 from tutorial_lib.tasks import TASKS, get_task
 
@@ -45,7 +46,6 @@ class Study:
 
 
 KAPPAS = (0.5, 0.7, 0.9)
-NOISES = (0.0, 0.1, 0.2, 0.3, 0.5, 1.0, 2.0, 4.0)
 SIZES = ({"crm": "linear"}, {"crm_width": 16, "crm_layers": 1}, {"crm_width": 64}, {"crm_width": 256}) + (
     {"crm_width": 512, "crm_layers": 5},
 )
@@ -78,7 +78,7 @@ STUDIES: dict[str, Study] = {
     ),
     "crm-noise": Study(
         "Table 2: how much noise should the reconstruction model be trained with?",
-        (Grid(options=tuple({"crm_noise": noise, "crm_noise_rate": 0.0} for noise in NOISES)),),
+        (Grid(options=tuple({"crm_noise": noise, "crm_noise_rate": 0.0} for noise in TABLE2["noise"])),),
         diagnoses=True,
     ),
     "crm-size": Study("How large must the reconstruction model be?", (Grid(options=SIZES),), diagnoses=True),

@@ -22,13 +22,14 @@ from tutorial_lib.costs.reconstruction import (
 from tutorial_lib.data.dataset import Dataset
 from tutorial_lib.data.sources import SHIPPED_DATA, load_dataset
 from tutorial_lib.files import written_whole
+from tutorial_lib.studies.paper import TABLE2
 from tutorial_lib.tasks import Task, get_task
 
 PATH = SHIPPED_DATA / "results" / "reconstruction.csv"
 SIZES = {"linear": (0, 0), "1 x 16": (1, 16), "2 x 64": (2, 64), "3 x 128": (3, 128), "5 x 512": (5, 512)}
 """Hidden layers and width. The last is the paper's, '2 x 64' is profile small's."""
-NOISES = (0.0, 0.1, 0.2, 0.3, 0.5, 1.0, 2.0, 4.0)
-"""Table 2's levels."""
+NOISES = TABLE2["noise"]
+"""Standard deviations of the noise on the inputs, in discounted cost."""
 STEPS = 2_000
 """Iterations of Algorithm 1 for every size, at a batch of 256."""
 

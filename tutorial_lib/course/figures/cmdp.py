@@ -24,7 +24,7 @@ def all_tasks(seed: int = 0, size=(320, 240), family: str = "bullet"):
     shown = [task for task in TASKS.values() if task.family == family and task.scene is not None]
     if not shown:
         raise ValueError(f"no task of the family {family!r} has a scene")
-    tasks = {(task.scene, task.robot): task for task in shown}
+    tasks = {(scene_of(task), task.robot): task for task in shown}
     scenes, robots = (list(dict.fromkeys(part)) for part in zip(*tasks, strict=True))
     shape, figsize = (len(scenes), len(robots)), (3 * len(robots), 2.45 * len(scenes))
     figure, axes = subplots(*shape, figsize=figsize, squeeze=False)
