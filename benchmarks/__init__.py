@@ -1,4 +1,4 @@
-"""How fast this machine trains and simulates: `python -m benchmarks` measures it in about a minute.
+"""`python -m benchmarks` measures in about a minute how fast this machine trains and simulates.
 
 `python -m benchmarks --full` takes some minutes. It measures every algorithm, a plain version of C2IQL, other
 libraries' algorithms, and how the time grows with seeds, batch size and data. The tables and the figure of
@@ -31,17 +31,17 @@ from tutorial_lib.tasks import Task, get_task
 
 __all__ = ["PARTS", "bench", "full", "install", "machine", "training"]
 BUSY = 10
-"""Percent of the cores' time. Where other programs take more, two processes are not compared with one."""
+"""Percent of the cores' time. If other programs use more, several processes are not compared with one."""
 
 
 def bench(
     task: Task, workers: int | None = None, rounds: int = 3, seconds: float = 0.6, device: Device = "cpu"
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Both tables, `training` and `simulation`.
+    """The tables `training` and `simulation` of C2IQL on one task.
 
-    A measurement of training lasts `seconds` or one update, on a GPU twice that.
+    One measurement of training lasts `seconds`, or one update if that is longer, and twice as long on a GPU.
     """
-    workers = workers or joblib.cpu_count()  # the cores that this process may use
+    workers = workers or joblib.cpu_count()  # the number of cores that this process may use
     kinds: tuple[dict[str, Any], ...] = ({}, {"runs": 3}, {"products": "bfloat16"})
     cases = [Case("C2IQL", task.name, profile, **kind) for profile in PROFILES for kind in kinds]
     with tqdm(total=(rounds + 1) * (len(cases) + 6), desc="measuring", leave=False) as bar:
@@ -60,9 +60,9 @@ def training(
 ) -> pd.DataFrame:
     """One row per case of one task and algorithm: updates per second, and each part's share of the time.
 
-    These are real updates on random transitions. `hours` is the time of all updates of the profile, without
-    the training of the reconstruction model. `of_product` is the arithmetic per second as a share of that of
-    one large product of float32 matrices.
+    The updates are real, the transitions are random. `hours` is the time of all updates of the profile,
+    without the training of the reconstruction model. `of_product` is the arithmetic per second as a share of
+    that of one large product of float32 matrices.
     """
     found = with_shares(measure([Case(PRODUCT, cases[0].task), *cases], rounds, seconds, device, done))
     rows, by = [], ["profile", "products", "runs"]
@@ -86,7 +86,10 @@ def full(
     device: Device = "cpu",
     missing: Callable[[str], object] = tqdm.write,
 ) -> list[Path]:
-    """Measure everything on one thread, and write the files of `folder`. Returns their paths."""
+    """Measure everything on one thread, and write the files of `folder`. Returns their paths.
+
+    `missing` is called with a sentence for everything that is not measured.
+    """
     torch.set_num_threads(1)
     workers, busy = workers or joblib.cpu_count(), psutil.cpu_percent(interval=1)
     everything, parts = groups(), list[pd.DataFrame]()

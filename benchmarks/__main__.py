@@ -8,7 +8,7 @@ import tyro
 from benchmarks import PARTS, bench, install, pages
 from benchmarks import full as measure_all
 from tutorial_lib.__main__ import Device, check_counts, check_device
-from tutorial_lib.tasks import get_task
+from tutorial_lib.tasks import Task, get_task
 
 
 def main(
@@ -49,12 +49,17 @@ def main(
         written = measure_all(workers=workers, rounds=rounds, device=device)
         print("\n".join(f"wrote {path}" for path in written))
         return
-    training_speeds, simulation_speeds = bench(record, workers, rounds, device=device)
-    print(f"C2IQL on {record.name}, {device}, {torch.get_num_threads()} thread(s): shares of an update")
+    show(record, workers, rounds, device)
+
+
+def show(task: Task, workers: int | None, rounds: int, device: Device) -> None:
+    """Measure one task and print both tables."""
+    training_speeds, simulation_speeds = bench(task, workers, rounds, device=device)
+    print(f"C2IQL on {task.name}, {device}, {torch.get_num_threads()} thread(s): shares of an update")
     shares = dict.fromkeys(("of_product", *PARTS), "{:.0%}".format)
     others = {"updates_per_second": "{:.1f}".format, "hours": "{:.2f}".format}
     print(training_speeds.to_string(index=False, formatters=shares | others))
-    print(f"\nSimulator of {record.name}: steps per second, and their share of bare simulator x processes")
+    print(f"\nSimulator of {task.name}: steps per second, and their share of bare simulator x processes")
     formats = {"steps_per_second": "{:.0f}".format, "of_bare": "{:.0%}".format}
     print(simulation_speeds.to_string(index=False, formatters=formats))
 

@@ -1,7 +1,7 @@
 """What is measured, and in which order.
 
-Machines are noisy. So everything that is compared is measured in turns, over several rounds, and a ratio is
-the median of the ratios of the rounds. All numbers depend on what else is running.
+The speed of a machine varies. So everything that is compared is measured in turns, over several rounds, and a
+ratio is the median of the ratios of the rounds. All numbers depend on what else is running.
 """
 
 import time
@@ -21,8 +21,8 @@ from tutorial_lib.tasks import TASKS as ALL_TASKS
 
 TASKS = ("AntCircle", "CarCircle")
 SMALL_CRM = "3 x 128"
-"""Layers of a smaller reconstruction model. On the noise that critics make it is 2% less exact than the
-paper's: `data/results/reconstruction.csv`."""
+"""The layers of a smaller reconstruction model. On the noise that critics make it is 2% less exact than the
+paper's model (`data/results/reconstruction.csv`)."""
 
 
 def groups() -> dict[str, list[Case]]:
@@ -62,7 +62,7 @@ def groups() -> dict[str, list[Case]]:
 
 
 def stopwatch(case: Case, device: Device = "cpu") -> Peer | Steps | OurUpdates:
-    """What times this case. Raises ValueError for a peer that is not installed."""
+    """An object whose `measure` times this case. Raises ValueError for a peer that is not installed."""
     if case.what in PEERS:
         return Peer(case, device)
     return Steps(case, device) if case.what in (EAGER, PRODUCT) else OurUpdates(case, device)
@@ -78,8 +78,8 @@ def measure(
 ) -> pd.DataFrame:
     """One row per case and round: the case, the round, FLOP per update, seconds per update and per part.
 
-    A measurement lasts `seconds` or one update, on a GPU twice that. A case that cannot be measured is left
-    out, and `missing` is called with the reason.
+    A measurement lasts `seconds`, or one update if that is longer, and twice as long on a GPU. A case that
+    cannot be measured is left out, and `missing` is called with the reason.
     """
     watches = {}
     for case in cases:
@@ -100,14 +100,13 @@ def measure(
 
 
 def side_by_side(case: Case, most: int, rounds: int = 3, seconds: float = 2.0) -> pd.DataFrame:
-    """One row per number of processes, 1 and `most`, and round: seconds per update of them all, by the clock.
+    """One row per number of processes, 1 and `most`, and round: seconds of real time per update of them all.
 
     Each process has one thread. Where other work keeps the cores busy, this says nothing about the code.
     """
     rows = []
-    with joblib.Parallel(
-        n_jobs=max(most, 2), batch_size=1
-    ) as pool:  # two: one job is in a process of its own
+    # At least two, so that a single job, too, is in a process of its own.
+    with joblib.Parallel(n_jobs=max(most, 2), batch_size=1) as pool:
         for turn in range(rounds + 1):  # the first turn is a warm-up
             for count in (1, most):
                 jobs = [joblib.delayed(_rate)(case, seconds if turn else 0)] * count
@@ -120,7 +119,7 @@ def side_by_side(case: Case, most: int, rounds: int = 3, seconds: float = 2.0) -
 
 
 def _rate(case: Case, seconds: float) -> float:
-    """Updates per second by the clock on the wall."""
+    """Updates per second of real time."""
     torch.set_num_threads(1)
     watch = OurUpdates(case)
     watch.now = time.perf_counter

@@ -1,8 +1,8 @@
-"""C2IQL as one would write it down first: one module and one optimiser per network, a loop over the critics.
+"""A plain version of C2IQL: one module and one optimiser per network, and a loop over the critics.
 
-The library's speed is compared with this version's, and its updates are tested against it: the two share no
-code. It knows profile `paper` and one run only: the zero penalty, cost heads that are scaled by 1 - gamma^T,
-and one threshold per transition.
+The speed of the library is compared with it, and the library's updates are tested against it. The two share
+no code. It has one run, and only what profile `paper` needs: the zero penalty, cost heads that are scaled by
+1 - gamma^T, and one threshold per transition.
 """
 
 import copy
@@ -18,7 +18,7 @@ from tutorial_lib.tasks import Task
 
 
 def network(inputs: int, width: int, layers: int, outputs: int) -> nn.Sequential:
-    """`layers` hidden layers of `width` ReLU units, and a linear output."""
+    """A network of `layers` hidden layers with `width` ReLU units each, and a linear output."""
     sizes = [inputs] + layers * [width]
     net: list[nn.Module] = []
     for a, b in zip(sizes[:-1], sizes[1:], strict=True):
@@ -27,11 +27,14 @@ def network(inputs: int, width: int, layers: int, outputs: int) -> nn.Sequential
 
 
 class EagerC2IQL:
-    """One run of Algorithm 2. The output o of a network is read as scale (1 + o), as in the library."""
+    """One run of Algorithm 2. As in the library, the value of an output o is scale (1 + o).
+
+    Raises ValueError for options that it does not have.
+    """
 
     def __init__(self, task: Task, config: C2IQLConfig, device: torch.device | str = "cpu"):
         if config.unsafe_price is not None or config.recorded_step or config.time_limits != "rate":
-            raise ValueError("the plain version knows the zero penalty and time_limits='rate' only")
+            raise ValueError("the plain version has only the zero penalty and time_limits='rate'")
         self.task, self.config, self.updates = task, config, 0
         obs, act, m = task.obs_dim + 1, task.act_dim, len(task.gammas)
         size = config.hidden_width, config.hidden_layers
@@ -55,17 +58,17 @@ class EagerC2IQL:
         self.mean, self.std = (f(task.obs_dim, device=device) for f in (torch.zeros, torch.ones))
 
     def network_input(self, observations: Tensor, limits: Tensor) -> Tensor:
-        """What the networks see: observations (B, obs) and limits (B,) as (B, obs + 1)."""
+        """The networks' input (B, obs + 1) for observations (B, obs) and limits (B,)."""
         code = torch.where(torch.isinf(limits), torch.tensor(1.5), limits / self.task.cost_range)
         return torch.cat([(observations - self.mean) / self.std, code[:, None]], dim=1)
 
     def reconstruct(self, q_cost: Tensor) -> Tensor:
-        """Lines 6 to 8: discounted costs (B, m) as the cost of an episode (B,)."""
+        """The cost of an episode, (B,), from discounted costs (B, m): lines 6 to 8."""
         x = q_cost * (1 - self.gammas**self.task.horizon)
         return self.crm((x - self.crm_mean) @ self.crm_whiten)[:, 0] * self.task.horizon
 
     def losses(self, batch: Batch, limits: Tensor) -> dict[str, Tensor]:
-        """The losses of Algorithm 2, by network."""
+        """The losses of Algorithm 2 by the name of the network, for B transitions and their limits (B,)."""
         c, a = self.config, batch.actions
         s = self.network_input(batch.observations, limits)
         s_next = self.network_input(batch.next_observations, limits)
@@ -107,7 +110,7 @@ class EagerC2IQL:
         }
 
     def update(self, batch: Batch, limits: Tensor) -> dict[str, float]:
-        """One step of every network on B transitions and their limits (B,). Returns the losses."""
+        """Change every network once, on B transitions and their limits (B,). Returns the losses."""
         c, losses = self.config, self.losses(batch, limits)
         cosine = 0.5 * (1 + math.cos(math.pi * self.updates / c.updates))
         self.optimisers["policy"].param_groups[0]["lr"] = c.policy_lr * cosine

@@ -1,4 +1,4 @@
-"""The figure of speed: updates per second of each library, and the cost of seeds that train together."""
+"""The figure of speed: updates per second of each library, and the time of seeds that train together."""
 
 import numpy as np
 import pandas as pd
@@ -17,7 +17,10 @@ PEER = "#E69F00"
 @or_not_run
 @one_figure
 def speed(updates: pd.DataFrame) -> Figure:
-    """From the raw rows of `python -m benchmarks --full`."""
+    """Draws updates per second, and the time per update against the number of seeds.
+
+    `updates` are the raw rows that `python -m benchmarks --full` wrote.
+    """
     figure, (left, right) = subplots(1, 2, figsize=(12, 5.5), width_ratios=(3, 2))
     part = updates[updates["group"] == f"yardsticks {TASKS[0]}"]
     rates = {name: 1 / seconds(part, **case_of(name)).median() for name in NAMES}

@@ -28,13 +28,13 @@ def speed_text() -> str:
 
 
 def write_speed() -> Path | None:
-    """Draw the figure of speed beside its files; None where nothing was measured."""
+    """Draw the figure of speed. Returns its path, or None where nothing was measured."""
     updates = tables.load("updates")
     return None if updates is None else drawn(speed(updates), tables.FOLDER / "speed.png")
 
 
 def pages() -> dict[Path, str]:
-    """Both pages as they should read now."""
+    """The text that both pages should have now, by path."""
     made = {ROOT / "README.md": speed_front, SHIPPED_DATA / "README.md": speed_text}
     return {path: between_marks(path.read_text(), "speed", table()) for path, table in made.items()}
 

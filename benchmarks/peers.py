@@ -1,9 +1,9 @@
 """Updates of other libraries, the peers, timed in a process of their own.
 
-That process sees packages which the project does not install. The peers use the project's PyTorch, and
-everything else comes from a folder of their own. Each one gets the same batch again and again, so sampling
-is not part of its time, while it is part of ours. They have the paper's widths and batch size; all other
-options are those of their own examples.
+That process can import packages which the project does not install. The peers use the project's PyTorch, and
+everything else comes from a folder of their own. Each one gets the same batch again and again: sampling is
+not part of its time, but it is part of ours. The peers have the paper's widths and batch size. All their
+other options are those of their own examples.
 """
 
 import functools
@@ -27,14 +27,15 @@ FOLDER = Path("runs/bench/peers")
 PACKAGES = (
     "osrl-lib==0.1.0",
     "d3rlpy==2.8.1",
-    # What d3rlpy needs and the project does not have. Of what OSRL lists nothing is: it pins an old PyTorch.
+    # What d3rlpy needs and the project does not have. OSRL's own requirements, which pin an old PyTorch, are
+    # not installed.
     *("gym==0.26.2", "gym_notices", "structlog", "colorama", "dataclasses-json", "marshmallow"),
     *("typing-inspect", "mypy-extensions", "scikit-learn", "narwhals", "threadpoolctl"),
 )
 
 
 def install(folder: Path = FOLDER) -> None:
-    """Install the peers into a folder with pip, 60 MB. Raises ValueError with pip's last line if it fails."""
+    """Install the peers (60 MB) into a folder with pip. Raises ValueError with pip's last line."""
     command = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--upgrade"]
     done = subprocess.run([*command, "--target", folder, *PACKAGES], capture_output=True, text=True)
     if done.returncode:
@@ -43,7 +44,7 @@ def install(folder: Path = FOLDER) -> None:
 
 
 class Peer:
-    """Times a peer's updates. Raises ValueError, with the reason, where it does not run."""
+    """Times the updates of a peer. Raises ValueError, with the reason, if the peer does not run."""
 
     def __init__(self, case: Case, device: Device = "cpu", folder: Path = FOLDER):
         self.asked = {"what": case.what, "task": case.task, "profile": case.profile, "device": str(device)}
@@ -55,6 +56,7 @@ class Peer:
         return {"seconds": self._ask(seconds)["seconds"]}
 
     def _ask(self, seconds: float) -> dict[str, float]:
+        """The answer of the peers' process. Raises ValueError."""
         pipes = self.process.stdin, self.process.stdout
         assert pipes[0] and pipes[1]  # _process opened both
         try:
@@ -70,7 +72,7 @@ class Peer:
 
 @functools.cache
 def _process(folder: Path) -> subprocess.Popen:
-    """The process that answers for all peers; it ends with this one, when its input does."""
+    """The process that runs all peers. It ends when its input ends, which is at the end of this process."""
     path = [str(folder), str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", "")]
     threads = str(torch.get_num_threads())
     return subprocess.Popen(
@@ -87,15 +89,14 @@ def _process(folder: Path) -> subprocess.Popen:
 
 
 def osrl(name: str, task: Task, config: Config, device: str) -> Callable[[], object]:
-    """OSRL's CPQ or BCQ-Lag: its trainer's step, without a logger."""
+    """A function that makes one update of OSRL's CPQ or BCQ-Lag: its trainer's step, without a logger."""
 
     class Logger:
         def store(self, **scalars: object) -> None:
             pass
 
-    loggers = types.ModuleType(
-        "fsrl.utils"
-    )  # OSRL uses nothing else of that package, which needs many others
+    # OSRL imports nothing but loggers from package fsrl, which needs many other packages.
+    loggers = types.ModuleType("fsrl.utils")
     vars(loggers).update(DummyLogger=Logger, WandbLogger=Logger)
     sys.modules |= {"fsrl": types.ModuleType("fsrl"), "fsrl.utils": loggers}
     from osrl import algorithms
@@ -108,7 +109,7 @@ def osrl(name: str, task: Task, config: Config, device: str) -> Callable[[], obj
         "beta": 0.5,
     }
     if name == "CPQ":
-        sizes |= {"num_q": 2, "num_qc": 2}  # BCQ-Lag's are pairs already
+        sizes |= {"num_q": 2, "num_qc": 2}  # BCQ-Lag has pairs of critics by default
     options = sizes | {"episode_len": task.horizon, "device": device}
     model = getattr(algorithms, name)(task.obs_dim, task.act_dim, 1.0, **options)
     trainer = getattr(algorithms, f"{name}Trainer")(model, None, Logger(), device=device)
@@ -118,7 +119,7 @@ def osrl(name: str, task: Task, config: Config, device: str) -> Callable[[], obj
 
 
 def d3rlpy(task: Task, config: Config, device: str) -> Callable[[], object]:
-    """d3rlpy's IQL: its update, on a batch of NumPy arrays as in its own loop."""
+    """A function that makes one update of d3rlpy's IQL, on a batch of NumPy arrays as in its own loop."""
     from d3rlpy.algos import IQLConfig
     from d3rlpy.dataset import TransitionMiniBatch
     from d3rlpy.models.encoders import VectorEncoderFactory
@@ -144,20 +145,25 @@ PEERS: dict[str, Callable[..., Callable[[], object]]] = {
 
 @functools.cache
 def _step(what: str, task: str, profile: str, device: str) -> tuple[Callable[[], object], float]:
+    """The function that makes one update of a peer, and its FLOP per call. They are made once."""
     step = PEERS[what](get_task(task), Case(what, task, profile).config, device)
     return step, flop_of(step)
 
 
 def main() -> None:
-    """Read lines of JSON, what to time and for how long; answer each with FLOP and seconds, or an error."""
-    answers, sys.stdout = sys.stdout, sys.stderr  # a peer may print, and that is no answer
+    """Read requests, one line of JSON each, and print one line of JSON for each.
+
+    A request says what to time and for how long. The answer has the FLOP and seconds per update, or the
+    error.
+    """
+    answers, sys.stdout = sys.stdout, sys.stderr  # what a peer prints must not be among the answers
     for line in sys.stdin:
         asked = json.loads(line)
         seconds = asked.pop("seconds")
         try:
             step, flop = _step(**asked)
             answer: dict[str, Any] = {"flop": flop, "seconds": timed(step, seconds, asked["device"])}
-        except Exception as error:  # whatever a peer stumbles over
+        except Exception as error:  # a peer may raise anything
             answer = {"error": f"{type(error).__name__}: {' '.join(str(error).split())}"}
         print(json.dumps(answer), file=answers, flush=True)
 

@@ -1,4 +1,4 @@
-"""How fast `c2iql evaluate` plays episodes, compared with the bare simulator and the same actions."""
+"""Measures how fast `c2iql evaluate` plays episodes, compared with the bare simulator on the same actions."""
 
 import functools
 import time
@@ -18,21 +18,21 @@ from tutorial_lib.tasks import Task, make_env
 def simulation(
     task: Task, workers: int, rounds: int = 3, done: Callable[[], object] = lambda: None
 ) -> pd.DataFrame:
-    """One row per way to play: processes, steps per second, and the share of bare simulator x processes.
+    """One row per way to play: processes, steps per second, and their share of the bare speed x processes.
 
     The bare simulator and our environment play the actions of the rollouts' policy, in whole episodes with
     their resets.
     """
     agent = C2IQL(task, C2IQL.configure("small"))
-    actions = _actions(agent)
+    actions = policy_actions(agent)
     cases = {
-        ("bare simulator", 1): lambda: _play("bare", task.name, actions),
-        ("our environment", 1): lambda: _play("ours", task.name, actions),
-        ("rollouts", 1): lambda: _rollouts(agent, 1),
-        ("bare simulator", workers): lambda: _play_beside("bare", task.name, actions, workers),
-        # The warm-up plays this first, because it needs the most memory: joblib replaces processes whose memory
-        # has grown much since their first job.
-        ("rollouts", workers): lambda: _rollouts(agent, workers),
+        ("bare simulator", 1): lambda: play("bare", task.name, actions),
+        ("our environment", 1): lambda: play("ours", task.name, actions),
+        ("rollouts", 1): lambda: play_rollouts(agent, 1),
+        ("bare simulator", workers): lambda: play_beside("bare", task.name, actions, workers),
+        # The warm-up plays this first, as it needs the most memory: joblib replaces processes whose memory
+        # grew much since their first job.
+        ("rollouts", workers): lambda: play_rollouts(agent, workers),
     }
     speeds = np.zeros((rounds + 1, len(cases)))
     for turn in range(rounds + 1):  # the first, backwards, is a warm-up: it starts processes and simulators
@@ -58,18 +58,19 @@ class Recorder(C2IQL):
         self.taken: list[np.ndarray] = []
 
     def act(self, *args: Any, **kwargs: Any) -> np.ndarray:
+        """The actions (E, act) of the agent, which are also appended to `taken`."""
         self.taken.append(super().act(*args, **kwargs))
         return self.taken[-1]
 
 
-def _actions(agent: C2IQL) -> np.ndarray:
-    """The actions of the untrained agent in its first episodes: (T, E, act)."""
+def policy_actions(agent: C2IQL) -> np.ndarray:
+    """The actions (T, E, act) of an untrained agent with the same options in its first E episodes."""
     recorder = Recorder(agent.task, agent.config, agent.seeds)
     playing.rollout(recorder, agent.task.thresholds[0], range(playing.EPISODES_TOGETHER))
     return np.stack(recorder.taken)
 
 
-def _play(kind: str, task_name: str, actions: np.ndarray) -> int:
+def play(kind: str, task_name: str, actions: np.ndarray) -> int:
     """Play every episode of `actions` (T, E, act), one after the other. Returns the number of steps."""
     env = _environment(kind, task_name)
     for seed in range(actions.shape[1]):
@@ -80,20 +81,20 @@ def _play(kind: str, task_name: str, actions: np.ndarray) -> int:
     return actions.shape[0] * actions.shape[1]
 
 
-def _play_beside(kind: str, task_name: str, actions: np.ndarray, workers: int) -> int:
-    """`_play` in several processes at once, which share the machine."""
-    jobs = [joblib.delayed(_play)(kind, task_name, actions)] * workers
+def play_beside(kind: str, task_name: str, actions: np.ndarray, workers: int) -> int:
+    """Run `play` in several processes at once. Returns the number of steps of all."""
+    jobs = [joblib.delayed(play)(kind, task_name, actions)] * workers
     return sum(joblib.Parallel(n_jobs=workers)(jobs))
 
 
 @functools.lru_cache
 def _environment(kind: str, task_name: str) -> Any:
-    """A process makes one and keeps it. The bare simulator is what gymnasium.make gives, without wrappers."""
+    """The environment of this process: ours, or the bare simulator without gymnasium's wrappers."""
     env = make_env(task_name)
     return env if kind == "ours" else env._sim
 
 
-def _rollouts(agent: C2IQL, workers: int) -> int:
+def play_rollouts(agent: C2IQL, workers: int) -> int:
     """Play as `c2iql evaluate` does, one job for each worker. Returns the number of steps."""
     episodes = playing.EPISODES_TOGETHER * workers
     return int(playing.evaluate(agent, agent.task.thresholds[:1], episodes, workers)["length"].sum())

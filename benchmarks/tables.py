@@ -15,7 +15,7 @@ FILES = {name: f"{name}.csv" for name in ("machine", "updates", "simulation")}
 NOT_RUN = "*Not measured: `python -m benchmarks --full` does it.*"
 OURS, SMALL = "C2IQL", f"C2IQL, its reconstruction model {SMALL_CRM}"
 ROUNDED, BOTH = "C2IQL in bfloat16", f"C2IQL in bfloat16, its reconstruction model {SMALL_CRM}"
-NAMES = {  # of a row in the table: (what, products, crm)
+NAMES = {  # the names of the table's rows, and what they measure: (what, products, crm)
     "C2IQL": (OURS, "float32", "5 x 512"),
     SMALL: (OURS, "float32", SMALL_CRM),
     ROUNDED: (OURS, "bfloat16", "5 x 512"),
@@ -30,41 +30,41 @@ NAMES = {  # of a row in the table: (what, products, crm)
 
 
 def load(name: str, folder: Path | None = None) -> pd.DataFrame | None:
-    """One of the files, or None where nothing was measured."""
+    """The table in one of the files, or None where nothing was measured."""
     path = (folder or FOLDER) / FILES[name]
     return pd.read_csv(path) if path.exists() else None
 
 
 def with_shares(updates: pd.DataFrame) -> pd.DataFrame:
-    """With `share`: arithmetic per second over that of one large float32 product in the same round."""
+    """The same rows with `share`: FLOP per second over that of the float32 product in the same round."""
     product = updates[(updates["what"] == PRODUCT) & (updates["products"] == "float32")]
     rate = (product["flop"] / product["seconds"]).set_axis(product["round"])
     return updates.assign(share=updates["flop"] / updates["seconds"] / updates["round"].map(rate))
 
 
 def part_shares(updates: pd.DataFrame) -> pd.DataFrame:
-    """Each part's share of the parts' sum, row by row."""
+    """The share of each part in the sum of the parts, for each row."""
     parts = updates[list(PARTS)]
     return parts.div(parts.sum(axis=1), axis=0)
 
 
 def seconds(updates: pd.DataFrame, **case: object) -> pd.Series:
-    """Seconds per update of one case, by round; empty where it was not measured."""
+    """The seconds per update of one case by round. Empty where it was not measured."""
     return _select(updates, case).set_index("round")["seconds"]
 
 
 def case_of(name: str) -> dict:
-    """The columns that make one of `NAMES`."""
+    """The values of columns that select the rows of one of `NAMES`."""
     return dict(zip(("what", "products", "crm"), NAMES[name], strict=True))
 
 
 def ratios(updates: pd.DataFrame, slow: dict, fast: dict) -> pd.Series:
-    """How many times as fast, by round; empty, or NaN, where one was not measured."""
+    """How many times faster `fast` is than `slow`, by round. Empty or NaN where one was not measured."""
     return seconds(updates, **slow) / seconds(updates, **fast)
 
 
 def yardsticks(updates: pd.DataFrame) -> pd.DataFrame:
-    """One row per entry of `NAMES`, profile `paper`: updates per second, share, ratio to the plain one."""
+    """One row per name in `NAMES`, in profile `paper`: updates/s, share, ratio to the plain version."""
     rows = []
     parts = {task: with_shares(updates[updates["group"] == f"yardsticks {task}"]) for task in TASKS}
     for name in NAMES:
@@ -85,7 +85,7 @@ def yardsticks(updates: pd.DataFrame) -> pd.DataFrame:
 
 
 def marks(updates: pd.DataFrame) -> pd.DataFrame:
-    """The aims, and what one run found: ratios, as median (lowest to highest) over its rounds."""
+    """The aims, and the ratios of one measurement, as median (lowest to highest) over its rounds."""
     ours, small, plain, peer = map(case_of, (OURS, SMALL, EAGER, "OSRL's CPQ"))
     aims = {
         "arithmetic, against that of one large product": ("0.8", None),
@@ -117,7 +117,7 @@ def marks(updates: pd.DataFrame) -> pd.DataFrame:
 
 
 def by_algorithm(updates: pd.DataFrame) -> pd.DataFrame:
-    """Updates per second of every algorithm: one row each, one column per profile and task."""
+    """Updates per second: one row per algorithm, one column per profile and task."""
     part = updates[updates["group"] == "algorithms"]
     speed = 1 / part.groupby(["what", "profile", "task"], sort=False)["seconds"].median()
     table = speed.unstack(["profile", "task"])
@@ -126,7 +126,7 @@ def by_algorithm(updates: pd.DataFrame) -> pd.DataFrame:
 
 
 def by_precision(updates: pd.DataFrame) -> pd.DataFrame:
-    """Updates per second in either precision, by profile and number of seeds, and the ratio by round."""
+    """Updates per second in both precisions and their ratio, by profile and number of seeds."""
     rows = []
     part = updates[updates["group"] == "precision"]
     for (profile, runs), own in part.groupby(["profile", "runs"], sort=False):
@@ -148,7 +148,7 @@ def by_part(updates: pd.DataFrame) -> pd.DataFrame:
 def growth(updates: pd.DataFrame) -> pd.DataFrame:
     """Milliseconds per update as seeds, batch, dataset or tasks grow, and the ratio of last to first.
 
-    Tasks are trained one after the other. Of them it is the ratio of the sum to the largest, AntCircle.
+    Tasks are trained one after the other. Their ratio is that of the sum to the largest task, AntCircle.
     """
     rows = []
     for group, column in (("seeds", "runs"), ("batch", "batch"), ("rows", "rows")):
@@ -179,16 +179,18 @@ def rollouts(simulation: pd.DataFrame) -> pd.DataFrame:
 
 
 def circumstances(machine: pd.DataFrame) -> str:
-    """The machine in one sentence."""
+    """One sentence about the machine and its software."""
     return ", ".join(f"{what} {value}" for what, value in machine.to_numpy()) + "."
 
 
 def _select(updates: pd.DataFrame, case: dict) -> pd.DataFrame:
+    """The rows whose columns have these values."""
     for column, value in case.items():
         updates = updates[updates[column] == value]
     return updates
 
 
 def _in_words(found: pd.Series) -> str:
+    """The median (lowest to highest) as text."""
     found = found.dropna()
     return f"{found.median():.2f} ({found.min():.2f} to {found.max():.2f})" if len(found) else "not measured"

@@ -1,6 +1,6 @@
-"""Times what one update takes, and for the library's algorithms each of its parts.
+"""Measures the time of one update, and for the library's algorithms the time of each of its parts.
 
-The time does not depend on the values of the data, so the data are random.
+The time does not depend on the values of the data. So the data are random.
 """
 
 import contextlib
@@ -24,36 +24,38 @@ from tutorial_lib.tasks import Task, get_task
 
 Device = torch.device | str
 PARTS = ("sampling", "reconstruction", "networks", "backward", "optimiser")
-"""The parts of an update: everything random (`Agent.draw_all`); the cost reconstruction
-model; the other networks and the losses; their gradients, with the learning rates and the clipping; Adam's
-step, the target networks and the variables."""
+"""The parts of an update: everything random (`Agent.draw_all`); the cost reconstruction model; the other
+networks and the losses; the gradients, with the learning rates and the clipping; Adam's step, the target
+networks and the variables."""
 PRODUCT, EAGER = "a product of 1024 x 1024", "plain eager C2IQL"
 PRODUCT_SIZE = 1024
 
 
 @dataclass(frozen=True)
 class Case:
-    """Something to be timed: updates of an algorithm, of the plain version or of a peer; a matrix product."""
+    """What is timed: updates of an algorithm, of the plain version or of a peer, or a matrix product."""
 
     what: str
+    """The name of the algorithm or the peer, `EAGER`, or `PRODUCT`."""
     task: str
+    """The name of the task whose sizes are used."""
     profile: str = "paper"
     runs: int = 1
-    """Seeds trained together."""
+    """The number of seeds that are trained together."""
     batch: int | None = None
-    """None: the profile's."""
+    """The batch size. None: the profile's."""
     rows: int = 10_000
-    """Transitions to sample from."""
+    """The number of transitions to sample from."""
     crm: str = "5 x 512"
-    """The reconstruction model's layers, in profile `paper`."""
+    """The layers of the reconstruction model in profile `paper`."""
     products: str = "float32"
-    """As in training, in either precision; or "default": what PyTorch does if it is not asked."""
+    """The multiplication: "float32" or "bfloat16" as in training, or "default", which is PyTorch's own."""
     processes: int = 1
-    """Of one thread each, at the same time."""
+    """The number of processes at the same time, with one thread each."""
 
     @property
     def config(self) -> Config:
-        """The options of the algorithm; C2IQL's for what is not an algorithm of the library."""
+        """The options of the algorithm. What is no algorithm of the library has the options of C2IQL."""
         config = ALGORITHMS.get(self.what, C2IQL).configure(self.profile)
         changes: dict[str, Any] = {}
         if self.products == "bfloat16":
@@ -66,16 +68,19 @@ class Case:
 
 
 def clock(device: Device = "cpu") -> Callable[[], float]:
-    """The processor's time where one thread does the work, else the time on the wall.
+    """The function that tells the time in seconds: CPU time where one thread does the work, else real time.
 
-    Other programs disturb the processor's time less. (Caches and memory are still shared with them.)
+    Other programs change CPU time less than real time. (Caches and memory are still shared with them.)
     """
     alone = torch.device(device).type == "cpu" and torch.get_num_threads() == 1
     return time.thread_time if alone else time.perf_counter
 
 
 def timed(step: Callable[[], object], seconds: float, device: Device = "cpu") -> float:
-    """Seconds per call of `step`, over as many as fit, at least one. A GPU is fed ahead, as in training."""
+    """Seconds per call of `step`, a mean over the calls that fit into `seconds`, at least one.
+
+    On a GPU, calls are queued without waiting for results, as in training.
+    """
     now, calls = clock(device), 0
     _wait_for(device)
     start = now()
@@ -87,14 +92,17 @@ def timed(step: Callable[[], object], seconds: float, device: Device = "cpu") ->
 
 
 def flop_of(step: Callable[[], object]) -> float:
-    """Floating-point operations of all matrix products in one call, as PyTorch counts them."""
+    """The number of floating-point operations of all matrix products in one call, as PyTorch counts them."""
     with FlopCounterMode(display=False) as counter:
         step()
     return counter.get_total_flops()
 
 
 class OurUpdates:
-    """Times the updates of one agent by laps: the time since the last lap is charged to one part."""
+    """Times the updates of one agent and their parts.
+
+    At the end of each part, `_lap` adds the time since its last call to that part.
+    """
 
     def __init__(self, case: Case, device: Device = "cpu"):
         kind, task = ALGORITHMS[case.what], get_task(case.task)
@@ -110,9 +118,9 @@ class OurUpdates:
         self._mark_laps()
 
     def measure(self, seconds: float) -> dict[str, float]:
-        """Seconds per update, in all and of each part, over as many updates as fit.
+        """Seconds per update and per part, means over the updates that fit into `seconds`.
 
-        Every lap waits for a GPU, which training does not do: on a GPU the whole is timed once more, without
+        Every lap waits for a GPU, but training does not. So on a GPU the whole update is timed again without
         laps.
         """
         self.laps, updates, self.last = dict.fromkeys(PARTS, 0.0), 0, None
@@ -136,7 +144,7 @@ class OurUpdates:
         self.agent.update(batch)
 
     def _mark_laps(self) -> None:
-        """End laps where an update goes on to its next part: around the model, before and after gradients."""
+        """Make an update call `_lap` around the model, before the gradients and after them."""
         if isinstance(self.agent, C2IQL) and self.agent.reconstructs:
             self.agent.reconstruction.register_forward_pre_hook(lambda *_: self._lap("networks"))
             self.agent.reconstruction.register_forward_hook(lambda *_: self._lap("reconstruction"))
@@ -151,6 +159,7 @@ class OurUpdates:
         adam.zero_grad = zero_grad  # type: ignore[method-assign]
 
     def _lap(self, part: str) -> None:
+        """Add the time since the last call to this part."""
         if not self.lapping:
             return
         _wait_for(self.device)
@@ -161,7 +170,7 @@ class OurUpdates:
 
 
 class Steps:
-    """Times calls of a function: the plain version's updates, or a matrix product."""
+    """Times calls of one function: an update of the plain version, or a matrix product."""
 
     def __init__(self, case: Case, device: Device = "cpu"):
         self.device, self.products = device, _setting(case.products)
@@ -175,16 +184,19 @@ class Steps:
 
 
 def _setting(name: str) -> Callable[[], AbstractContextManager]:
+    """The context manager for a value of `Case.products`."""
     return contextlib.nullcontext if name == "default" else products
 
 
 def _product(device: Device) -> Callable[[], object]:
+    """A function that multiplies two large float32 matrices."""
     a, b = torch.ones(2, PRODUCT_SIZE, PRODUCT_SIZE, device=device)
     out = torch.empty_like(a)
     return lambda: torch.mm(a, b, out=out)
 
 
 def _eager_updates(case: Case, device: Device) -> Callable[[], object]:
+    """A function that samples a batch and makes one update of the plain version."""
     task, config = get_task(case.task), case.config
     assert isinstance(config, C2IQLConfig)
     agent, data = EagerC2IQL(task, config, device), random_transitions(task, case.rows, device)
@@ -199,7 +211,7 @@ def _eager_updates(case: Case, device: Device) -> Callable[[], object]:
 
 
 def random_transitions(task: Task, count: int, device: Device = "cpu") -> Batch:
-    """`count` transitions of the task's sizes, with rewards and costs of about its scale."""
+    """`count` transitions with the task's sizes, whose values are uniform in [0, 1). None ends an episode."""
     generator = torch.Generator().manual_seed(0)
     shapes = [(count, task.obs_dim), (count, task.act_dim), (count,), (count,), (count, task.obs_dim)]
     data = [torch.rand(shape, generator=generator).to(device) for shape in shapes]
@@ -207,5 +219,6 @@ def random_transitions(task: Task, count: int, device: Device = "cpu") -> Batch:
 
 
 def _wait_for(device: Device) -> None:
+    """Wait until a GPU has finished all calls."""
     if torch.device(device).type == "cuda":
-        torch.cuda.synchronize(device)  # calls return before the device has done the work
+        torch.cuda.synchronize(device)  # a call returns before the GPU has finished

@@ -1,4 +1,4 @@
-"""A page per algorithm, made from its docstrings, its options, what it logs, and its results."""
+"""Writes one page per algorithm from its docstrings, its options, its log and its results."""
 
 import inspect
 import sys
@@ -13,7 +13,7 @@ from tutorial_lib.studies.results import load_results, not_run
 
 
 def write(folder: Path) -> None:
-    """Write `folder`/algorithms.md, the list, and `folder`/algorithms/NAME.md for every algorithm."""
+    """Write `folder`/algorithms.md, a list, and `folder`/algorithms/NAME.md for every algorithm."""
     (folder / "algorithms").mkdir(exist_ok=True)
     results = load_results("table1")
     for name, kind in ALGORITHMS.items():
@@ -30,12 +30,12 @@ def write(folder: Path) -> None:
 
 
 def first_sentence(kind: type[Agent]) -> str:
-    """The first paragraph of the class's docstring, as one line of a table."""
+    """The first paragraph of the class's docstring, as the text of one cell of a table."""
     return " ".join((inspect.getdoc(kind) or "").split("\n\n")[0].split()).replace("|", r"\|")
 
 
 def page(kind: type[Agent], results: pd.DataFrame) -> str:
-    """The page of one algorithm, in Markdown."""
+    """The page of one algorithm, in Markdown. `results` are the raw results of study `table1`."""
     told = "is trained for one limit" if kind.needs_limit else "is trained for no limit in particular"
     module = sys.modules[kind.__module__]
     parts = [
@@ -61,10 +61,11 @@ def page(kind: type[Agent], results: pd.DataFrame) -> str:
 
 
 def options_table(kind: type[Agent]) -> str:
-    """Every option with its defaults in the profiles and its meaning."""
+    """A table of the options: the defaults in both profiles, and the meaning."""
     paper, small = kind.configure("paper"), kind.configure("small")
     rows = [
-        f"| `{name}` | {getattr(paper, name)} | {getattr(small, name)} | {words.replace('|', chr(92) + '|')} |"
+        f"| `{name}` | {getattr(paper, name)} | {getattr(small, name)} | "
+        f"{words.replace('|', chr(92) + '|')} |"
         for name, words in describe(kind.Config).items()
         if name != "profile"
     ]
@@ -72,7 +73,7 @@ def options_table(kind: type[Agent]) -> str:
 
 
 def tasks_table(kind: type[Agent]) -> str:
-    """What tasks change in profile small; nothing where none does."""
+    """A table of the options that tasks change in profile `small`, or no text where no task changes one."""
     rows = [
         f"| {task} | {', '.join(f'`{name}={value}`' for name, value in changes.items())} |"
         for task, changes in kind.Config.tasks.items()
@@ -82,12 +83,15 @@ def tasks_table(kind: type[Agent]) -> str:
 
 
 def results_table(kind: type[Agent], results: pd.DataFrame) -> str:
-    """The algorithm's row of Table 1, one line per task."""
+    """The algorithm's results for Table 1, one row per task, or a sentence where there are none."""
     part = with_scores(results[results["algorithm"] == kind.name])
     if part.empty:
         return "It is no row of Table 1." if not kind.in_table1 else f"*{not_run('table1').capitalize()}.*"
     means = part.groupby("task", sort=False)[["reward_score", "cost_score"]].mean()
     seeds = part.groupby("task")["seed"].nunique()
     rows = [f"| {task} | {seeds[task]} | {r:.2f} | {c:.2f} |" for task, (r, c) in means.iterrows()]
-    words = "Study `table1` on the shipped data, means over seeds, limits and episodes; normalised as DSRL does:\n\n"
+    words = (
+        "Study `table1` on the shipped data, means over seeds, limits and episodes; "
+        "normalised as DSRL does:\n\n"
+    )
     return words + "\n".join(["| task | seeds | reward | cost |", "|---|---|---|---|", *rows])

@@ -1,4 +1,4 @@
-"""The course's site: the executed notebooks, and pages on the library made from its docstrings."""
+"""Sphinx's configuration of the site: the executed notebooks, and pages made from docstrings."""
 
 import importlib
 import json
@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 from markdown_it import MarkdownIt
+from sphinx.application import Sphinx
 
 import tutorial_lib
 
@@ -21,31 +22,35 @@ copyright = "2026, the C2IQL tutorial authors"
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.mathjax", "sphinx-mathjax-offline"]
 exclude_patterns = ["tutorial_lib"]
 
-nb_execution_mode = "off"  # the Makefile has executed them
+nb_execution_mode = "off"  # the Makefile has executed the notebooks
 nb_output_stderr = "remove"
 nb_merge_streams = True
-nb_render_markdown_format = "myst"  # plain CommonMark, the default, knows no tables
-nb_code_prompt_show = "Show a solution"  # nothing else is hidden
+nb_render_markdown_format = "myst"  # the default, plain CommonMark, has no tables
+nb_code_prompt_show = "Show a solution"  # only solutions are hidden
 nb_code_prompt_hide = "Hide it"
-nb_ipywidgets_js = {}  # sliders need a running kernel, and their scripts the network
+nb_ipywidgets_js = {}  # sliders need a running kernel, and their scripts need the network
 myst_enable_extensions = ["dollarmath", "amsmath"]
-myst_heading_anchors = 3  # the pages link to their own sections
+myst_heading_anchors = 3  # pages have links to their own sections
 autodoc_member_order = "bysource"
-add_module_names = False  # the page's title says it
+add_module_names = False  # the page's title has the module's name
 
 html_theme = "furo"
 html_static_path = html_css_files = ["style.css"]
 html_copy_source = False
 
 
-def setup(app):
+def setup(app: Sphinx) -> None:
+    """Connect this file's functions to Sphinx's events."""
     app.connect("builder-inited", write_reference_pages)
     app.connect("source-read", finish_page)
     app.connect("autodoc-process-docstring", read_docstring_as_markdown)
 
 
-def write_reference_pages(app):
-    """One page per module, in the order of the alphabet: a new module needs no line here."""
+def write_reference_pages(app: Sphinx) -> None:
+    """Write the pages of the algorithms, one page per module, and the list of the modules.
+
+    The modules are found automatically. Their order is alphabetical.
+    """
     modules = pkgutil.walk_packages(tutorial_lib.__path__, "tutorial_lib.")
     algorithms.write(Path(app.srcdir))
     names = sorted(module.name for module in modules if not module.name.endswith("__main__"))
@@ -63,14 +68,16 @@ def write_reference_pages(app):
 
 
 def first_paragraph(module: str) -> str:
+    """The first paragraph of a module's docstring, as the text of one cell of a table."""
     text = importlib.import_module(module).__doc__.split("\n\n")[0]
     return " ".join(text.split()).replace("|", r"\|")
 
 
-def finish_page(app, docname, source):
-    """A notebook loses what is for machines, and sliders their views, so that their words show.
+def finish_page(app: Sphinx, docname: str, source: list[str]) -> None:
+    """Change the text of a page, `source[0]`, before Sphinx reads it.
 
-    The first page gets its table of contents.
+    Notebooks lose the comments for machines. Their sliders lose the widgets' views, so that their text is
+    shown. The first page gets its table of contents.
     """
     if docname.startswith("notebooks/"):
         notebook = json.loads(source[0])
@@ -84,7 +91,7 @@ def finish_page(app, docname, source):
 
 
 def contents(folder: Path) -> str:
-    """A table of the notebooks: title, question and time, from the first cell of each."""
+    """A table of the notebooks in Markdown: title, question and time, read from the first cell of each."""
     rows = ["| notebook | question | time |", "|---|---|---|"]
     for path in sorted(folder.glob("notebooks/[0-9]*.ipynb")):
         text = "".join(json.loads(path.read_text())["cells"][0]["source"])
@@ -95,7 +102,9 @@ def contents(folder: Path) -> str:
     return "\n".join(rows)
 
 
-def read_docstring_as_markdown(app, what, name, obj, options, lines):
-    """The docstrings are plain prose with `code` in it, which is Markdown and no reStructuredText."""
+def read_docstring_as_markdown(
+    app: Sphinx, what: str, name: str, obj: object, options: object, lines: list[str]
+) -> None:
+    """Replace the lines of a docstring by HTML: docstrings are Markdown, which Sphinx does not read."""
     html = MarkdownIt().render("\n".join(lines))
     lines[:] = [".. raw:: html", "", *("   " + line for line in html.splitlines()), ""]

@@ -1,7 +1,7 @@
-"""`python site/slides.py FROM TO`: lecture slides of the notebooks in one folder, made in another.
+"""`python site/slides.py FROM TO` makes lecture slides from the notebooks in folder FROM, in folder TO.
 
-nbconvert makes the page of each notebook; `lecture/pages.js` then cuts it, in the browser, into pages that
-fit a screen. reveal.js and MathJax come from installed packages and lie beside the slides: no network is
+nbconvert makes one HTML page of each notebook. In the browser, `lecture/pages.js` divides it into pages that
+fit the screen. reveal.js and MathJax are copied from installed packages to the slides, so that no network is
 needed.
 """
 
@@ -17,7 +17,7 @@ from nbconvert import SlidesExporter
 from nbconvert.preprocessors import CoalesceStreamsPreprocessor
 
 HERE = Path(__file__).parent / "lecture"
-SCRIPTS = {  # from a package's folder to the slides' own
+SCRIPTS = {  # by package: the path of a file in the package's folder, and its path among the slides
     "sphinx_revealjs": {
         "_static/revealjs/dist/reveal.js": "dist/reveal.js",
         "_static/revealjs/dist/reveal.css": "dist/reveal.css",
@@ -28,6 +28,7 @@ SCRIPTS = {  # from a package's folder to the slides' own
 
 
 def exporter() -> SlidesExporter:
+    """nbconvert's exporter of slides, with the course's template and theme."""
     made = SlidesExporter(template_name="lecture", extra_template_basedirs=[str(HERE.parent)])
     made.exclude_input_prompt = made.exclude_output_prompt = made.exclude_anchor_links = True
     made.register_preprocessor(CoalesceStreamsPreprocessor, enabled=True)
@@ -42,23 +43,25 @@ def convert(path: Path) -> str:
     for cell in notebook.cells:
         if cell.cell_type == "markdown":
             cell.source = cell.source.replace(".ipynb)", ".html)")
-        for output in cell.get("outputs", []):  # no slider moves here: leave its words
+        for output in cell.get("outputs", []):  # no slider works here: its text is shown instead
             output.get("data", {}).pop("application/vnd.jupyter.widget-view+json", None)
     page, _ = exporter().from_notebook_node(notebook, {"metadata": {"name": title_of(notebook)}})
     return page
 
 
-def title_of(notebook) -> str:
+def title_of(notebook: nbformat.NotebookNode) -> str:
+    """The title of a notebook: the first line of its first cell."""
     return notebook.cells[0].source.splitlines()[0].removeprefix("# ")
 
 
 def index(titles: dict[str, str]) -> str:
-    """A page that leads to all slides; `titles` by file name."""
+    """The HTML page with links to all slides. `titles` has the title of each file by its name."""
     entries = [f'<li><a href="{name}">{html.escape(title)}</a></li>' for name, title in titles.items()]
     return (HERE / "contents.html").read_text().replace("ENTRIES", "\n".join(entries))
 
 
 def copy_scripts(target: Path) -> None:
+    """Copy all scripts and style sheets of the slides into the folder `target`."""
     (target / "dist" / "theme").mkdir(parents=True, exist_ok=True)
     for package, files in SCRIPTS.items():
         folder = Path(find_spec(package).origin).parent
@@ -69,6 +72,7 @@ def copy_scripts(target: Path) -> None:
 
 
 def main(source: Path, target: Path) -> None:
+    """Write the slides of all notebooks in `source`, their scripts, and a page of contents to `target`."""
     copy_scripts(target / "scripts")
     titles = {}
     for path in sorted(source.glob("[0-9]*.ipynb")):

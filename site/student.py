@@ -1,23 +1,26 @@
-"""`python site/student.py FROM TO`: the notebooks of one folder without their solutions, in another.
+"""`python site/student.py FROM TO` writes the notebooks of folder FROM without their solutions to folder TO.
 
-The cell of a solution goes. Its exercise keeps its cell, where each `...` that a student is to replace
-becomes a raise that says so: whatever needs an unsolved exercise stops with its name, and its checker tells
-it too. An exercise without a `...` is a faulty function to repair, and stays as it is.
+The cells of solutions are removed. In the cell of an exercise, each `...` that a student must replace becomes
+a `raise` which says so. Code that needs an unsolved exercise then stops with the exercise's name, and the
+exercise's check reports it too. An exercise without a `...` is a faulty function to repair, and stays as it
+is.
 """
 
 import ast
 import sys
 from pathlib import Path
+from typing import Any
 
 import nbformat
 from marks import END_SOLUTION, is_solution, remove_marks
 
 
-def without_solutions(notebook) -> None:
-    """Take the solutions out of a notebook, and the outputs of their exercises, in place.
+def without_solutions(notebook: nbformat.NotebookNode) -> None:
+    """Remove the solutions from a notebook, and the outputs of their exercises, in place.
 
-    An exercise is the last cell with a `...`, or with a function that the solution defines anew, and what
-    stands between it and the solution. Raises ValueError for a solution without an end or an exercise.
+    The exercise of a solution is the last code cell since the previous solution that has a `...`, or that
+    defines a function which the solution defines again. The outputs of all code cells from there to the
+    solution are removed. Raises ValueError for a solution without an end or an exercise.
     """
     since, kept = [], []
     for cell in notebook.cells:
@@ -32,7 +35,8 @@ def without_solutions(notebook) -> None:
     remove_marks(notebook)
 
 
-def _open_exercise(cells, solution) -> None:
+def _open_exercise(cells: list[nbformat.NotebookNode], solution: nbformat.NotebookNode) -> None:
+    """Prepare the exercise of a solution, which is one of the code cells before it. Raises ValueError."""
     if not solution.source.rstrip().endswith(END_SOLUTION):
         raise ValueError(f"no {END_SOLUTION!r} ends this cell:\n{solution.source}")
     solved = _functions(solution.source)
@@ -48,11 +52,12 @@ def _open_exercise(cells, solution) -> None:
 
 
 def _functions(source: str) -> set[str]:
+    """The names of the functions that a cell defines."""
     return {node.name for node in ast.parse(source).body if isinstance(node, ast.FunctionDef)}
 
 
 def _open_lines(source: str) -> dict[int, tuple[int, str]]:
-    """Where `...` stands as a statement or as a value, and what for: {line: (indentation, name)}."""
+    """The lines where `...` is a statement or an assigned value: {line: (indentation, its name)}."""
     found = {}
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.FunctionDef):
@@ -65,11 +70,12 @@ def _open_lines(source: str) -> dict[int, tuple[int, str]]:
     return found
 
 
-def _is_ellipsis(value) -> bool:
+def _is_ellipsis(value: Any) -> bool:
     return isinstance(value, ast.Constant) and value.value is ...
 
 
 def _raise_where_left_open(source: str) -> str:
+    """The source of an exercise, with a `raise` in place of each `...`."""
     lines = source.splitlines()
     for number, (indentation, name) in _open_lines(source).items():
         words = f'raise NotImplementedError("exercise: write {name} in place of this line")'
@@ -78,6 +84,7 @@ def _raise_where_left_open(source: str) -> str:
 
 
 def main(source: Path, target: Path) -> None:
+    """Write all notebooks in `source` without their solutions to `target`."""
     target.mkdir(parents=True, exist_ok=True)
     for path in sorted(source.glob("[0-9]*.ipynb")):
         notebook = nbformat.read(path, as_version=4)

@@ -16,7 +16,8 @@ def randomise(agent, seed=0):
     for value in state.values():
         if value.is_floating_point():
             value.copy_(0.5 * torch.randn(value.shape, generator=generator))
-    state["variable.observation_std"] = 0.5 + state["variable.observation_std"].abs()
+    if (std := state.get("variable.observation_std")) is not None:
+        std.copy_(0.5 + std.abs())
     agent.load_state(state)
 
 

@@ -1,7 +1,5 @@
 """Behaviour cloning: its loss by a loop, what it clones, and which episodes the safe one sees."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 import torch
@@ -9,21 +7,19 @@ from torch.func import functional_call
 
 from tutorial_lib.agents import get_algorithm
 from tutorial_lib.checkpoints import load_agent, save_agent
-from tutorial_lib.config import get_profile
-from tutorial_lib.data.dataset import Batch, Dataset, DatasetError
+from tutorial_lib.data.dataset import Dataset, DatasetError
 from tutorial_lib.playing import evaluate
 from tutorial_lib.tasks import get_task
 from tutorial_lib.training import train
 
 TASK = get_task("BallRun")
-CONFIG = dataclasses.replace(
-    get_profile("small"), hidden_width=16, hidden_layers=1, batch_size=64, steps=400, profile="test"
-)
+OPTIONS = {"hidden_width": 16, "hidden_layers": 1, "batch_size": 64, "updates": 400}
 CHEAP, DEAR = np.array([0.6, -0.2]), np.array([-0.4, 0.7])
 
 
-def make_agent(name, threshold=None, seeds=(0,), **changes):
-    return get_algorithm(name)(TASK, dataclasses.replace(CONFIG, **changes), seeds, threshold)
+def make_agent(name, limits=None, seeds=(0,), **changes):
+    kind = get_algorithm(name)
+    return kind(TASK, kind.configure("small", TASK, **OPTIONS | changes), seeds, limits)
 
 
 def make_dataset(costs=(10, 30, 31, 80), length=100):
@@ -58,9 +54,8 @@ def test_the_loss_is_the_mean_squared_error():
         x = torch.tensor(np.array([state]), dtype=torch.float32)
         out = functional_call(agent.modules["policy"], weights, x)[0][0]
         total += sum((o - w) ** 2 for o, w in zip(out.tolist(), action, strict=True))
-    fields = {name: torch.zeros(1, 12) for name in Batch._fields}
-    fields |= {"observations": torch.tensor(s[None]).float(), "actions": torch.tensor(a[None]).float()}
-    scalars = agent.update(Batch(**fields), [torch.Generator()])
+    batch = {"observations": torch.tensor(s[None]).float(), "actions": torch.tensor(a[None]).float()}
+    scalars = agent.update(batch | {"limit": torch.zeros(1, 12)})
     assert scalars["policy_loss"].item() == pytest.approx(total / 24, rel=1e-4)
 
 
@@ -73,36 +68,44 @@ def test_all_clones_the_mean_of_what_was_done_and_safe_what_the_safe_did():
     assert np.abs(taken(everyone).mean(0) - (CHEAP + DEAR) / 2).max() < 0.1  # states tell nothing here
 
 
-@pytest.mark.parametrize(("threshold", "kept"), [(9, 0), (10, 1), (30, 2), (31, 3), (79.5, 3), (80, 4)])
-def test_the_limit_itself_is_safe_and_no_safe_episode_is_an_error_that_says_so(threshold, kept):
-    agent, data = make_agent("BC-Safe", threshold), make_dataset()
+@pytest.mark.parametrize(("limit", "kept"), [(9, 0), (10, 1), (30, 2), (31, 3), (79.5, 3), (80, 4)])
+def test_the_limit_itself_is_safe_and_no_safe_episode_is_an_error_that_says_so(limit, kept):
+    agent, data = make_agent("BC-Safe", limit), make_dataset()
     if kept:
-        assert agent.select_episodes(data).episode_costs.tolist() == [10, 30, 31, 80][:kept]
+        assert agent.select(data, limit).episode_costs.tolist() == [10, 30, 31, 80][:kept]
     else:
         with pytest.raises(DatasetError, match="BC-Safe: no episode costs at most 9: the cheapest of 4"):
             train(agent, data, progress=False)
-    assert make_agent("BC-All").select_episodes(data) is data
+    everything = make_agent("BC-All").select(data, limit)
+    np.testing.assert_array_equal(everything.observations, data.observations)
+    np.testing.assert_array_equal(everything.episode_costs, data.episode_costs)
 
 
-def test_observations_are_normalised_by_what_is_trained_on():
-    data, agent = make_dataset(), make_agent("BC-Safe", 30.0, steps=1)
+def test_every_run_learns_from_the_safe_episodes_of_its_own_limit():
+    """Runs under a limit of 30 and of 80, side by side: their actions, and what normalises observations."""
+    data, agent = make_dataset(), make_agent("BC-Safe", (30.0, 80.0), seeds=(0, 0))
     train(agent, data, progress=False)
-    np.testing.assert_allclose(agent.observation_mean, data.observations[:200].mean(0), atol=1e-5)
+    assert np.abs(taken(agent, 0) - CHEAP).mean() < 0.15
+    assert np.abs(taken(agent, 1).mean(0) - (CHEAP + DEAR) / 2).max() < 0.1
+    for run, rows in enumerate((200, 400)):
+        seen, variables = data.observations[:rows], agent.networks(run)
+        np.testing.assert_allclose(variables.observation_mean, seen.mean(0), atol=1e-5)
+        np.testing.assert_allclose(variables.observation_std, seen.std(0) + 1e-3, rtol=1e-5)
 
 
 def test_killed_and_resumed_it_still_sees_safe_episodes_alone(tmp_path):
-    data = make_dataset()
-    train(make_agent("BC-Safe", 30.0, steps=30), data, steps=10, run_dir=tmp_path, progress=False)
-    resumed, whole = make_agent("BC-Safe", 30.0, steps=30), make_agent("BC-Safe", 30.0, steps=30)
+    data, changes = make_dataset(), {"updates": 30}
+    train(make_agent("BC-Safe", 30.0, **changes), data, updates=10, run_dir=tmp_path, progress=False)
+    resumed, whole = (make_agent("BC-Safe", 30.0, **changes) for _ in range(2))
     train(resumed, data, run_dir=tmp_path, progress=False)
     train(whole, data, progress=False)
     np.testing.assert_array_equal(taken(resumed), taken(whole))
 
 
 def test_saved_loaded_and_evaluated_like_any_agent(tmp_path):
-    for name, threshold, limits in (("BC-All", None, [30, 50, 70]), ("BC-Safe", 30.0, [30])):
-        agent = make_agent(name, threshold, seeds=(0, 4))
-        train(agent, make_dataset(), steps=3, progress=False)
+    for name, own, limits in (("BC-All", None, [30, 50, 70]), ("BC-Safe", (30.0, 50.0), [30, 50])):
+        agent = make_agent(name, own, seeds=(0, 4))
+        train(agent, make_dataset(), updates=3, progress=False)
         save_agent(agent, tmp_path / "agent.safetensors")
         results = evaluate(load_agent(tmp_path / "agent.safetensors"), episodes=1)
         assert sorted(set(results["threshold"])) == limits and set(results["seed"]) == {0, 4}

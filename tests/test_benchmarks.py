@@ -1,8 +1,9 @@
-"""What is timed is what is said: the plain version against the library's updates, the turns, the tables."""
+"""The benchmarks: the plain version against the library's updates, what is timed, the tables, the command."""
 
-import dataclasses
+import os
 import subprocess
-from concurrent.futures import ThreadPoolExecutor
+import sys
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -11,24 +12,25 @@ import pytest
 import torch
 
 import benchmarks
-from benchmarks import cases, peers, tables, updates
+from benchmarks import __main__ as command
+from benchmarks import cases, pages, peers, tables, updates
 from benchmarks.eager import EagerC2IQL
+from benchmarks.figure import speed
+from benchmarks.simulation import play, play_rollouts, policy_actions
 from benchmarks.updates import EAGER, PARTS, PRODUCT, Case, OurUpdates, random_transitions
-from tutorial_lib.__main__ import bench
-from tutorial_lib.agents import ALGORITHMS, get_algorithm
-from tutorial_lib.config import get_profile
-from tutorial_lib.course import figures
+from tutorial_lib.agents import ALGORITHMS
+from tutorial_lib.agents.c2iql import C2IQL
 from tutorial_lib.data.dataset import Batch
 from tutorial_lib.matmul import products
-from tutorial_lib.studies import report
-from tutorial_lib.tasks import TASKS
+from tutorial_lib.tasks import TASKS, make_env
 
+ROOT = Path(__file__).parents[1]
 SMALL = {
     "hidden_width": 24,
     "batch_size": 64,
     "crm_width": 16,
     "crm_layers": 2,
-    "steps": 50,
+    "updates": 50,
     "target_tau": 0.1,
 }
 
@@ -65,7 +67,7 @@ def same_networks(eager, agent):
                     layer.bias.data.copy_(bias)
     eager.crm.load_state_dict(agent.reconstruction.net.state_dict())
     eager.crm_mean, eager.crm_whiten = agent.reconstruction.mean, agent.reconstruction.whiten
-    eager.mean, eager.std = agent.observation_mean, agent.observation_std
+    eager.mean, eager.std = (agent.variables[f"observation_{name}"][0] for name in ("mean", "std"))
 
 
 @pytest.mark.parametrize("critics", [1, 2, 3])
@@ -74,17 +76,17 @@ def test_updates_are_those_of_a_plain_version(critics, reward_limits):
     """Ten updates in a row, as they run in training: losses and, at last, every parameter."""
     task = TASKS["CarCircle"]
     options = SMALL | {"cost_critics": critics, "reward_time_limits": reward_limits}
-    config = dataclasses.replace(get_profile("paper"), **options)
-    agent, eager = get_algorithm("C2IQL")(task, config), EagerC2IQL(task, config)
+    config = C2IQL.configure("paper", **options)
+    agent, eager = C2IQL(task, config), EagerC2IQL(task, config)
     generator = torch.Generator().manual_seed(0)
     agent.reconstruction.whiten.copy_(0.1 * torch.randn(3, 3, generator=generator))
-    agent.observation_mean.fill_(0.5)
+    agent.variables["observation_mean"].fill_(0.5)
     same_networks(eager, agent)
     data = random_transitions(task, 500)
     flags = (torch.rand(2, 500, generator=generator) < 0.1).float()
     data = data._replace(terminals=flags[0], timeouts=flags[1])
     with torch.no_grad():  # limits on either side of what the actions seem to cost
-        sa = torch.cat([eager.see(data.observations, torch.full((500,), 50.0)), data.actions], 1)
+        sa = torch.cat([eager.network_input(data.observations, torch.full((500,), 50.0)), data.actions], 1)
         q_costs = [eager.cost_scale * (1 + critic(sa)) for critic in eager.targets["cost_critics"]]
         costs = torch.stack([eager.reconstruct(q_cost) for q_cost in q_costs]).amax(0)
     safe = []
@@ -93,8 +95,8 @@ def test_updates_are_those_of_a_plain_version(critics, reward_limits):
             batch = Batch(*(x[torch.randint(500, (64,), generator=generator)] for x in data))
             limits = costs.mean() + 5 * costs.std() * torch.randn(64, generator=generator)
             limits[:8] = torch.inf
-            agent.draw_limits = lambda *_, limits=limits: limits
-            found = agent.update(Batch(*(x[None] for x in batch)), [generator])
+            drawn = batch._asdict() | {"limit": limits}
+            found = agent.update({name: x[None] for name, x in drawn.items()})
             expected = eager.update(batch, limits)
             safe.append(found["safe_fraction"].item())
             for name, loss in expected.items():
@@ -112,7 +114,7 @@ def test_updates_are_those_of_a_plain_version(critics, reward_limits):
 
 def test_the_plain_version_refuses_what_it_does_not_know():
     with pytest.raises(ValueError, match="zero penalty"):
-        EagerC2IQL(TASKS["CarCircle"], get_profile("small"))
+        EagerC2IQL(TASKS["CarCircle"], C2IQL.configure("small"))
 
 
 # --- Timing ---
@@ -133,14 +135,34 @@ def test_time_is_charged_to_the_part_that_took_it(monkeypatch):
         return slow
 
     agent = watch.agent
-    agent.draw_limits = taking("sampling", agent.draw_limits)  # once a run
+    agent.draw = taking("sampling", agent.draw)  # once a run
     agent.reconstruction.net.forward = taking("reconstruction", agent.reconstruction.net.forward)
     agent.network_input = taking("networks", agent.network_input)  # at s and at s'
-    agent.optimiser.zero_grad = taking("backward", agent.optimiser.zero_grad)
-    agent._cosine = taking("backward", agent._cosine)  # before Adam's step
+    weight = agent.parameters["value"]["net.0.weight"]
+    weight.register_hook(taking("backward", lambda gradient: None))  # once, when its gradient is known
+    agent.tau = taking("optimiser", agent.tau)  # of the two networks that have targets
     found = watch.measure(0)
-    calls = {"sampling": 2, "reconstruction": 1, "networks": 2, "backward": 2, "optimiser": 0}
-    assert found == {"seconds": 28.0} | {part: calls[part] * durations[part] for part in PARTS}
+    calls = {"sampling": 2, "reconstruction": 1, "networks": 2, "backward": 1, "optimiser": 2}
+    assert found == {"seconds": 52.0} | {part: calls[part] * durations[part] for part in PARTS}
+
+
+def test_every_algorithm_is_timed_as_it_trains():
+    """The same numbers as the agent's own `draw_all` and `update`: the laps change nothing."""
+    for name, kind in ALGORITHMS.items():
+        watch = OurUpdates(Case(name, "CarCircle", "small", runs=2, batch=16, rows=50))
+        agent = watch.agent
+        assert type(agent) is kind and agent.updates == 1  # one update to count its arithmetic
+        found = watch.measure(0)
+        assert agent.updates == 2 and found["seconds"] == pytest.approx(sum(found[part] for part in PARTS))
+        same = kind(agent.task, agent.config, agent.seeds, agent.limits)
+        if hasattr(agent, "reconstruction"):
+            same.reconstruction = agent.reconstruction
+        generators = [torch.Generator().manual_seed(seed) for seed in agent.seeds]
+        with products():
+            for _ in range(2):
+                same.update(same.draw_all(watch.data, generators))
+        for key, value in same.state().items():
+            torch.testing.assert_close(agent.state()[key], value, rtol=1e-4, atol=1e-5, msg=f"{name}: {key}")
 
 
 def test_on_a_gpu_the_whole_is_timed_without_waiting_within_an_update(monkeypatch):
@@ -226,13 +248,19 @@ def test_every_part_of_an_update_takes_time():
     assert (shares > 0).all() and shares.sum(1) == pytest.approx(1)
     assert table["of_product"].between(0.001, 2).all()
     hours = table["hours"] * table["updates_per_second"] * 3600
-    assert hours.tolist() == pytest.approx([get_profile("small").steps] * 3)
+    assert hours.tolist() == pytest.approx([C2IQL.configure("small").updates] * 3)
 
 
-def test_a_case_in_bfloat16_trains_in_bfloat16():
+def test_a_case_has_the_options_of_its_algorithm():
     for precision in ("float32", "bfloat16", "default"):
         watch = OurUpdates(Case("BC-All", "BallRun", "small", products=precision))
         assert watch.agent.config.precision == ("bfloat16" if precision == "bfloat16" else "float32")
+    sizes = Case("C2IQL", "BallRun", crm="3 x 128", batch=64).config
+    assert (sizes.crm_layers, sizes.crm_width, sizes.batch_size) == (3, 128, 64)
+    for name, kind in ALGORITHMS.items():
+        for profile in ("paper", "small"):
+            assert Case(name, "BallRun", profile).config == kind.configure(profile)
+    assert Case("OSRL's CPQ", "BallRun").config == Case(EAGER, "BallRun").config == C2IQL.configure("paper")
 
 
 # --- Peers ---
@@ -316,7 +344,7 @@ def folder(tmp_path, monkeypatch):
         {"what": ["bare simulator"], "processes": 1, "steps_per_second": 1000.0, "of_bare": 1.0}
     )
     monkeypatch.setattr(cases, "stopwatch", Watch)
-    monkeypatch.setattr(bench, "simulation", lambda *_: one)
+    monkeypatch.setattr(benchmarks, "simulation", lambda *_: one)
     monkeypatch.setattr(psutil, "cpu_percent", lambda interval: 30.0)
     said = []
     benchmarks.full(tmp_path, workers=2, rounds=2, missing=said.append)
@@ -366,18 +394,12 @@ def test_tables_by_hand(folder):
 
 
 def test_two_processes_are_compared_by_the_clock(monkeypatch):
-    pools = []
-
-    def threads(count, mp_context):
-        pools.append((count, mp_context.get_start_method()))
-        return ThreadPoolExecutor(count)
-
-    monkeypatch.setattr(cases, "ProcessPoolExecutor", threads)
-    monkeypatch.setattr(cases, "_rate", lambda case, seconds: 4.0)
+    here = os.getpid()
+    rate = lambda case, seconds: 4.0 if os.getpid() != here else np.nan  # noqa: E731 (sent by value)
+    monkeypatch.setattr(cases, "_rate", rate)
     found = cases.side_by_side(Case("C2IQL", "AntCircle"), 2, rounds=1).assign(group="processes")
     assert found[["processes", "seconds"]].to_numpy().tolist() == [[1, 0.25], [2, 0.125]]
     assert tables.ratios(found, {"processes": 1}, {"processes": 2}).tolist() == [2]
-    assert pools == [(1, "spawn"), (2, "spawn")]  # one alone is not the process that measures
 
 
 def test_what_was_not_measured_is_left_out(folder):
@@ -389,16 +411,83 @@ def test_what_was_not_measured_is_left_out(folder):
     assert rows.loc["OSRL's CPQ", "AntCircle: updates/s"] == "not measured"
     marks = tables.marks(found).set_index("mark")
     assert set(marks.filter(like="OSRL", axis=0)["AntCircle"]) == {"not measured"}
-    labels = [label.get_text() for label in figures.speed(found).axes[0].get_yticklabels()]
+    labels = [label.get_text() for label in speed(found).axes[0].get_yticklabels()]
     assert "C2IQL" in labels and "OSRL's CPQ" not in labels
 
 
 def test_the_pages_show_the_files_or_say_that_there_are_none(folder, monkeypatch):
     monkeypatch.setattr(tables, "FOLDER", folder)
-    assert report.write_speed() == folder / "speed.png"
-    figure = figures.speed(tables.load("updates", folder))
+    assert pages.write_speed() == folder / "speed.png"
+    figure = speed(tables.load("updates", folder))
     bars = [bar.get_width() for bar in figure.axes[0].patches]
     assert len(bars) == len(tables.NAMES) and max(bars) == pytest.approx(1000 / 3)
-    assert "| C2IQL | " in report.speed_text() and "cost of five seeds" in report.speed_front()
+    assert "| C2IQL | " in pages.speed_text() and "cost of five seeds" in pages.speed_front()
     monkeypatch.setattr(tables, "FOLDER", folder / "nowhere")
-    assert report.speed_text() == report.speed_front() == tables.NOT_RUN and report.write_speed() is None
+    assert pages.speed_text() == pages.speed_front() == tables.NOT_RUN and pages.write_speed() is None
+
+
+def test_the_pages_are_up_to_date():
+    assert [path.relative_to(ROOT) for path in pages.pages()] == [Path("README.md"), Path("data/README.md")]
+    for path, text in pages.pages().items():
+        assert path.read_text() == text, f"{path} is out of date: run `python -m benchmarks --report`"
+
+
+# --- The command ---
+
+
+def benchmarks_command(*words):
+    """What `python -m benchmarks` prints, typed in the project's folder."""
+    line = [sys.executable, "-m", "benchmarks", *words]
+    return subprocess.run(line, cwd=ROOT, capture_output=True, text=True)
+
+
+def test_help_says_what_is_measured():
+    done = benchmarks_command("--help")
+    assert (done.returncode, done.stderr) == (0, "") and "usage: python -m benchmarks" in done.stdout
+    for word in ("how fast this machine trains", "--workers", "--full", "--peers", "--report"):
+        assert word in done.stdout
+
+
+def test_an_error_is_one_line():
+    done = benchmarks_command("--task", "Ball")
+    assert done.returncode == 1 and done.stdout == "" and done.stderr.count("\n") == 1
+    assert done.stderr.startswith("benchmarks: unknown task 'Ball'")
+    with pytest.raises(ValueError, match="--rounds 0: must be 1 or more"):
+        command.main(rounds=0)
+
+
+def test_a_machine_without_cuda_says_so(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(ValueError, match="^--device cuda: "):
+        command.main(device="cuda")
+
+
+def test_it_prints_both_tables(monkeypatch, capsys):
+    tiny = C2IQL.configure("small", hidden_width=8, hidden_layers=1, batch_size=8, crm_width=8, crm_layers=1)
+    monkeypatch.setattr(benchmarks, "PROFILES", ("small",))
+    monkeypatch.setattr(C2IQL, "configure", lambda profile: tiny)
+    command.main("BallRun", workers=1, rounds=1)
+    lines = [line.split() for line in capsys.readouterr().out.splitlines()]
+    rows = [line for line in lines if line[:1] == ["small"]]
+    assert [row[1:3] for row in rows] == [["1", "float32"], ["3", "float32"], ["1", "bfloat16"]]
+    for row in rows:
+        shares = [int(cell.rstrip("%")) for cell in row[6:]]
+        assert len(shares) == len(PARTS) and 98 <= sum(shares) <= 102
+        assert float(row[3]) > 1
+    assert ["bare", "simulator", "1"] in [line[:3] for line in lines]
+    assert any(line[:2] == ["rollouts", "1"] and 0 < int(line[3].rstrip("%")) < 200 for line in lines)
+
+
+def test_the_same_actions_are_played_in_every_way():
+    agent = C2IQL(TASKS["BallRun"], C2IQL.configure("small", hidden_width=8))
+    actions = policy_actions(agent)
+    assert actions.shape == (100, 10, 2)
+    first = make_env("BallRun").reset(seed=3)[0]
+    told = np.full(1, agent.task.thresholds[0])
+    assert actions[0, 3] == pytest.approx(agent.act(first[None], told)[0])  # episode 3, step 0
+    assert (
+        play_rollouts(agent, 1)
+        == play("ours", "BallRun", actions)
+        == play("bare", "BallRun", actions)
+        == 1000
+    )

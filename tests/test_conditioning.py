@@ -7,11 +7,14 @@ import pytest
 import torch
 
 from tutorial_lib.costs.conditioning import (
-    check_threshold,
+    ConditioningConfig,
+    check_limit,
+    draw_thresholds,
     encode,
     nearest_threshold,
     rescaled_budget,
     threshold_set,
+    told_limit,
 )
 from tutorial_lib.tasks import TASKS
 
@@ -36,16 +39,26 @@ def test_every_threshold_has_a_code_of_its_own_and_infinity_the_largest(task):
     assert (np.diff(codes) > 0.1).all() and codes[-1] > 1 >= codes[-2]
 
 
-@pytest.mark.parametrize("threshold", [0, 0.5, 30, math.inf])
-def test_a_threshold_is_any_number_from_zero_on(threshold):
-    result = check_threshold(threshold)
-    assert result == threshold and isinstance(result, float)
+@pytest.mark.parametrize("limit", [0, 0.5, 30, math.inf])
+def test_a_limit_is_any_number_from_zero_on(limit):
+    result = check_limit(limit)
+    assert result == limit and isinstance(result, float)
 
 
-@pytest.mark.parametrize("threshold", [-1, -1e-9, -math.inf, math.nan])
-def test_a_threshold_that_is_negative_or_no_number_is_an_error_that_shows_it(threshold):
-    with pytest.raises(ValueError, match=f"threshold must be zero or more, not {threshold}"):
-        check_threshold(threshold)
+@pytest.mark.parametrize("limit", [-1, -1e-9, -math.inf, math.nan])
+def test_a_limit_that_is_negative_or_no_number_is_an_error_that_shows_it(limit):
+    with pytest.raises(ValueError, match=f"limit on the cost must be zero or more, not {limit}"):
+        check_limit(limit)
+
+
+@pytest.mark.parametrize("zero", [False, True])
+def test_thresholds_are_drawn_from_the_whole_set_in_equal_shares(zero):
+    config = ConditioningConfig(batch_size=5_000, zero_threshold=zero)
+    draws = draw_thresholds(CAR_RUN, config, torch.Generator().manual_seed(0))
+    expected = [0.0] * zero + [10, 20, 40, math.inf]
+    assert draws.dtype == torch.float32 and sorted(set(draws.tolist())) == expected
+    shares = [(draws == threshold).float().mean().item() for threshold in expected]
+    assert shares == pytest.approx([1 / len(expected)] * len(expected), abs=0.03)
 
 
 # --- Eq. 23: (L - spent) T / (T - t) ---
@@ -111,3 +124,59 @@ def test_a_limit_of_the_set_stays_itself_while_it_is_spent_on_schedule(task):
         for t in range(task.horizon):
             budget = rescaled_budget(limit, limit * t / task.horizon, t, task.horizon)
             assert nearest_threshold(budget, task) == limit
+
+
+# --- What is told: CarRun's horizon is 200, and a step costs 1 at most ---
+
+
+def told(limit, spent, t, remaining=False, **options):
+    config = ConditioningConfig.make("paper").changed(**options)
+    return told_limit(CAR_RUN, config, np.array([limit]), np.array([spent]), t, remaining).tolist()
+
+
+@pytest.mark.parametrize(
+    ("limit", "spent", "t", "expected"),
+    [
+        (20, 0, 0, 20),  # at the start: the limit itself
+        (20, 10, 100, 20),  # on schedule
+        (20, 0, 100, 40),  # twice the rate is left
+        (20, 20, 100, 10),  # spent: the smallest
+        (20, 30, 190, 10),  # overspent
+        (20, 9, 199, math.inf),  # 11 are left for one step, which costs 1 at most
+        (20, 10, 190, math.inf),  # 10 are left for ten steps
+        (20, 10, 189, 40),  # 10 are left for eleven steps: 10 * 200 / 11 is about 182
+        (math.inf, 50, 0, math.inf),
+        (200, 0, 0, math.inf),  # a limit that no episode can exceed
+        (199, 0, 0, 40),
+    ],
+)
+def test_told_limits_by_hand_where_infinity_is_told_once_all_is_covered(limit, spent, t, expected):
+    assert told(limit, spent, t) == [expected]
+
+
+@pytest.mark.parametrize(
+    ("rule", "expected"),
+    [("covered", [10, 40, math.inf]), ("nearest", [10, math.inf, math.inf])] + [("never", [10, 40, 40])],
+)
+def test_when_infinity_is_told(rule, expected):
+    """Rescaled, the budgets are 10, 60 (infinity's code) and 2000 (the last step's)."""
+    given = [told(limit, 0, t, infinite_at_test=rule) for limit, t in ((10, 0), (30, 100), (10, 199))]
+    assert given == [[threshold] for threshold in expected]
+
+
+def test_a_spent_budget_is_told_as_zero_where_the_set_holds_one():
+    assert told(20, 20, 100) == [10] and told(20, 20, 100, zero_threshold=True) == [0]
+    assert told(20, 25, 100, zero_threshold=True) == [0] and told(20, 18, 100, zero_threshold=True) == [0]
+    assert told(20, 17, 100, zero_threshold=True) == [10]  # 3 are left for half of the steps: 6
+
+
+def test_a_remaining_budget_is_not_rescaled():
+    assert told(20, 0, 100, remaining=True) == [20] and told(20, 0, 100) == [40]
+    assert told(20, 12, 199, remaining=True) == [math.inf]
+    assert told(20, 12, 199, remaining=True, infinite_at_test="never") == [10]
+
+
+def test_every_episode_is_told_its_own():
+    limits, spent = np.array([10.0, 20, 40, math.inf]), np.array([9.0, 0, 20, 3])
+    config = ConditioningConfig.make("paper")
+    assert told_limit(CAR_RUN, config, limits, spent, 100).tolist() == [10, 40, 40, math.inf]

@@ -2,17 +2,15 @@
 
 import dataclasses
 import math
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
-from randoms import random_batch, randomise
-from torch.func import functional_call
+from plain import Plain
+from randoms import of_run, random_batch, random_data, randomise
 
 from tutorial_lib import training
 from tutorial_lib.agents.cpq import CPQ, PushedCPQ
-from tutorial_lib.config import Config
 from tutorial_lib.course.maximisation_bias import latent_divergences
 from tutorial_lib.data.dataset import Batch, Dataset
 from tutorial_lib.tasks import TASKS
@@ -28,18 +26,13 @@ TASK = dataclasses.replace(
     min_return=-5.0,
     max_return=40.0,
 )
-CONFIG = Config(profile="test", gamma=0.8, batch_size=B, steps=100, hidden_width=8, hidden_layers=1)
+OPTIONS = {"gamma": 0.8, "batch_size": B, "updates": 100, "hidden_width": 8, "hidden_layers": 1}
 LIMIT = 3.0
-NETWORKS_OF = {  # which networks a loss trains
-    "critic": {"critics"},
-    "cost_critic": {"cost_critics"},
-    "policy": {"policy"},
-}
-NETWORKS_OF_PUSHED = NETWORKS_OF | {"vae": {"encoder", "decoder"}}
+SCALARS = ("critic_loss", "cost_critic_loss", "policy_loss", "safe_fraction", "negative_q")
 
 
-def make_agent(kind=CPQ, seeds=(0,), threshold=LIMIT, **changes):
-    return kind(TASK, dataclasses.replace(CONFIG, **changes), seeds=seeds, threshold=threshold)
+def make_agent(kind=CPQ, seeds=(0,), limits=LIMIT, **changes):
+    return kind(TASK, kind.configure("paper", **OPTIONS | changes), seeds=seeds, limits=limits)
 
 
 # --- The equations as loops ---
@@ -51,6 +44,12 @@ class Slow:
     def __init__(self, agent, run):
         self.config, self.run = agent.config, run
         self.state = {key: value.numpy().copy() for key, value in agent.state().items()}
+        self.log_multiplier = self.state.get("variable.log_multiplier", [0.0] * (run + 1))[run]
+
+    def inputs(self, observation):
+        """The normalised observation."""
+        mean, std = (self.state[f"variable.observation_{name}"][self.run] for name in ("mean", "std"))
+        return (observation - mean) / std
 
     def weights(self, prefix):
         return [v[self.run].astype(float) for k, v in self.state.items() if k.startswith(prefix)]
@@ -94,16 +93,17 @@ class Slow:
         terms = [(math.exp(z) ** 2 + m * m - 1) / 2 - z for m, z in zip(mean, log_std, strict=True)]
         return sum(terms) / len(terms)
 
-    def losses(self, batch, next_noise, noise):
-        gamma = self.config.gamma
-        limit = LIMIT * sum(gamma**t for t in range(T)) / T
-        sums = dict.fromkeys((f"{name}_loss" for name in NETWORKS_OF), 0.0)
-        sums |= {"safe_fraction": 0.0, "negative_q": 0.0}
+    def rows(self, batch):
+        """Each transition and the noise that belongs to it, in double precision."""
         for row in range(B):
-            x = Batch(*(field[row].numpy().astype(float) for field in batch))
-            mean, std = self.state["observation_mean"], self.state["observation_std"]
-            s, s_next = (x.observations - mean) / std, (x.next_observations - mean) / std
-            a_next = self.act(s_next, next_noise[row])
+            x = Batch(**{field: batch[field][row].numpy().astype(float) for field in Batch._fields})
+            yield row, x, self.inputs(x.observations), self.inputs(x.next_observations)
+
+    def losses(self, batch):
+        gamma, sums = self.config.gamma, dict.fromkeys(SCALARS, 0.0)
+        limit = LIMIT * sum(gamma**t for t in range(T)) / T
+        for row, x, s, s_next in self.rows(batch):
+            a_next = self.act(s_next, batch["next_noise"][row].numpy())
             cost_next = min(self.q_cost("target", s_next, a_next))
             q_next = min(self.q("target", s_next, a_next)) if cost_next <= limit else 0.0
             y = x.rewards + (0.0 if x.terminals or x.timeouts else gamma * q_next)
@@ -112,7 +112,7 @@ class Slow:
             errors = [(y_cost - q) ** 2 for q in self.q_cost("online", s, x.actions)]
             sums["cost_critic_loss"] += sum(errors) / B
 
-            action = self.act(s, noise[row])
+            action = self.act(s, batch["noise"][row].numpy())
             safe = min(self.q_cost("online", s, action)) <= limit
             q = min(self.q("online", s, action))
             sums["policy_loss"] -= safe * q / B
@@ -120,17 +120,17 @@ class Slow:
             sums["negative_q"] += (q < 0) / B
         return sums
 
-    def pushed_losses(self, batch, next_noise, noise, sample_noise, latent_noise):
-        sums, samples = self.losses(batch, next_noise, noise), []
+    def pushed_losses(self, batch):
+        sums, samples = self.losses(batch), []
         limit = LIMIT * sum(self.config.gamma**t for t in range(T)) / T
-        sums |= {"vae_loss": 0.0, "alpha": math.exp(self.state["online.multiplier.log"][self.run])}
-        for row in range(B):
-            x = Batch(*(field[row].numpy().astype(float) for field in batch))
-            s = (x.observations - self.state["observation_mean"]) / self.state["observation_std"]
+        sums |= {"vae_loss": 0.0, "alpha": math.exp(self.log_multiplier)}
+        for row, x, s, _ in self.rows(batch):
             latent, log_std = self.latent(s, x.actions)
-            decoded = np.tanh(self.dense("decoder", s, latent + np.exp(log_std) * latent_noise[row]))
+            noise = batch["latent_noise"][row].numpy()
+            decoded = np.tanh(self.dense("decoder", s, latent + np.exp(log_std) * noise))
             sums["vae_loss"] += (sum((decoded - x.actions) ** 2) / ACT + 0.5 * self.kl(s, x.actions)) / B
-            samples += [(s, self.act(s, sample_noise[n][row])) for n in range(10)]
+            samples += [(s, self.act(s, noise[row].numpy())) for noise in batch["sample_noise"]]
+        assert len(samples) == 10 * B
         outside = sorted(samples, key=lambda pair: self.kl(*pair))[-len(samples) // 4 :]
         costs = [min(self.q_cost("online", *pair)) for pair in outside]
         sums["outside_cost"] = sum(costs) / len(costs)
@@ -143,108 +143,88 @@ class Slow:
 @pytest.mark.parametrize("seeds", [(4,), (4, 9)])
 def test_an_updates_losses_are_cpqs(kind, seeds, missing):
     """On batches with safe and unsafe actions, and where actions outside cost too little, or enough."""
-    agent, batch = make_agent(kind, seeds), random_batch(1, len(seeds), size=B)
-    noises = [agent.draw_noise(torch.Generator().manual_seed(seed), B) for seed in seeds]
+    agent = make_agent(kind, seeds)
+    batch = random_batch(agent)
     for seed in range(200):
         randomise(agent, seed)
         slow = []
         for run in range(len(seeds)):
             one = Slow(agent, run)
-            losses = one.losses if kind is CPQ else one.pushed_losses
-            slow.append(losses(Batch(*(x[run] for x in batch)), *(x.numpy() for x in noises[run])))
+            slow.append((one.losses if kind is CPQ else one.pushed_losses)(of_run(batch, run)))
         mixed = all(0.2 < one["safe_fraction"] < 0.8 for one in slow)
         if mixed and all(missing is None or (one["shortfall"] > 0) == missing for one in slow):
             break
     else:
         pytest.fail("no batch that shows everything")
-    scalars = agent.update(batch, [torch.Generator().manual_seed(seed) for seed in seeds])
+    scalars = agent.update(batch)
     for run, expected in enumerate(slow):
         found = {key: value[run].item() for key, value in scalars.items()}
         assert found == pytest.approx(expected, rel=1e-4, abs=1e-4)
 
 
-# --- What each loss reaches ---
+# --- The push ---
 
 
-def losses_and_leaves(agent, change=None):
-    leaves = {}
-    for key, value in agent.state().items():
-        kind, _, rest = key.partition(".")
-        if kind in ("online", "target"):
-            network, _, parameter = rest.partition(".")
-            place = network if kind == "online" else f"target_{network}"
-            leaves.setdefault(place, {})[parameter] = value[0].clone().requires_grad_()
-
-    def bound(place, parameters):
-        module = agent.modules[place.removeprefix("target_")]
-        return lambda *inputs: functional_call(module, parameters, inputs)
-
-    net = SimpleNamespace(**{place: bound(place, leaves[place]) for place in leaves})
-    for name in agent.frozen:
-        values = {key: value.detach() for key, value in leaves[name].items()}
-        setattr(net, f"frozen_{name}", bound(name, values))
-    batch = Batch(*(field[0] for field in random_batch(1, size=B)))
-    noise = agent.draw_noise(torch.Generator().manual_seed(0), B)
-    return agent.losses(net, batch, torch.full((B,), LIMIT), *noise)[0], leaves
-
-
-@pytest.mark.parametrize(("kind", "networks_of"), [(CPQ, NETWORKS_OF), (PushedCPQ, NETWORKS_OF_PUSHED)])
-def test_a_loss_reaches_its_own_networks_and_no_other(kind, networks_of):
-    agent = make_agent(kind)
-    randomise(agent, 0)
-    losses, leaves = losses_and_leaves(agent)
-    assert losses.keys() == networks_of.keys()
-    places = [(place, key) for place, parameters in leaves.items() for key in parameters]
-    for loss, value in losses.items():
-        tensors = [leaves[place][key] for place, key in places]
-        gradients = torch.autograd.grad(value, tensors, allow_unused=True, retain_graph=True)
-        reached = {p for p, g in zip(places, gradients, strict=True) if g is not None and g.any()}
-        assert reached == {(place, key) for place, key in places if place in networks_of[loss]}, loss
+def cost_gradients(agent):
+    """The gradients of the cost critics' loss in these critics' own parameters, in one run."""
+    plain = Plain(agent)
+    losses, _ = plain.losses(of_run(random_batch(agent), 0))
+    return torch.autograd.grad(losses["cost_critic"], list(plain.online["cost_critics"].parameters()))
 
 
 def test_the_price_of_actions_outside_has_a_gradient_in_proportion_to_the_multiplier():
     """OSRL's has none: see the module's list of departures. Where nothing is missing there is none either."""
-    gradients = []
+    agent, gradients = make_agent(PushedCPQ), []
+    randomise(agent, 0)
+    multiplier = agent.variables["log_multiplier"]
+    agent.fill_last_bias(("cost_critics",), [-9.0])
     for log in (0.0, 1.0, 2.0):
-        agent = make_agent(PushedCPQ)
-        randomise(agent, 0)
-        agent.fill_last_bias(("cost_critics",), -9.0)
-        agent.parameters["multiplier"]["log"].data.fill_(log)
-        losses, leaves = losses_and_leaves(agent)
-        gradients.append(torch.autograd.grad(losses["cost_critic"], list(leaves["cost_critics"].values())))
+        multiplier.fill_(log)
+        gradients.append(cost_gradients(agent))
     for at_0, at_1, at_2 in zip(*gradients, strict=True):
         one, two = at_1 - at_0, at_2 - at_0
         torch.testing.assert_close(two, one * (math.e**2 - 1) / (math.e - 1), rtol=1e-3, atol=1e-5)
     assert all((at_1 - at_0).abs().max() > 1e-3 for at_0, at_1, _ in zip(*gradients, strict=True))
-    agent.fill_last_bias(("cost_critics",), 90.0)
-    losses, leaves = losses_and_leaves(agent)
-    with_any = torch.autograd.grad(losses["cost_critic"], list(leaves["cost_critics"].values()))
-    agent.parameters["multiplier"]["log"].data.fill_(-5.0)
-    losses, leaves = losses_and_leaves(agent)
-    with_none = torch.autograd.grad(losses["cost_critic"], list(leaves["cost_critics"].values()))
-    torch.testing.assert_close(with_any, with_none, rtol=0, atol=0)
+    agent.fill_last_bias(("cost_critics",), [90.0])
+    with_any = cost_gradients(agent)
+    multiplier.fill_(-5.0)
+    torch.testing.assert_close(with_any, cost_gradients(agent), rtol=0, atol=0)
 
 
 def test_the_multiplier_takes_a_plain_step_and_stays_within_its_bounds():
     agent = make_agent(PushedCPQ, seeds=(0, 1))
-    generators = [torch.Generator().manual_seed(seed) for seed in (0, 1)]
-    log = agent.parameters["multiplier"]["log"]
+    batch, log = random_batch(agent), agent.variables["log_multiplier"]
     for start, cost, expected in ((0.3, 2.0, None), (5.0, 0.0, 5.0), (-5.0, 90.0, -5.0)):
-        log.data.fill_(start)
-        agent.fill_last_bias(("cost_critics",), cost)
-        scalars = agent.update(random_batch(1, runs=2, size=B), generators)
+        log.fill_(start)
+        agent.fill_last_bias(("cost_critics",), [cost, cost])
+        scalars = agent.update(batch)
         for run in (0, 1):
             missing = 1.5 * LIMIT * sum(0.8**t for t in range(T)) / T - scalars["outside_cost"][run].item()
             step = start + 1e-4 * math.exp(start) * missing if expected is None else expected
             assert log[run].item() == pytest.approx(step, abs=1e-6)
             assert (missing > 0) == (cost == 0.0)
-    log.data.fill_(5.0)
-    agent.fill_last_bias(("cost_critics",), 90.0)
-    agent.update(random_batch(1, runs=2, size=B), generators)
+    log.fill_(5.0)
+    agent.fill_last_bias(("cost_critics",), [90.0, 90.0])
+    agent.update(batch)
     assert (log < 5.0).all()  # a bound can be left
 
 
-# --- Noise and checkpoints ---
+def test_the_noise_of_an_update_has_the_shapes_that_it_is_for_and_nothing_is_drawn_twice():
+    agent = make_agent(PushedCPQ)
+    drawn = agent.draw(random_data(0), torch.Generator().manual_seed(3), LIMIT)
+    noise = {key: drawn[key] for key in ("next_noise", "noise", "sample_noise", "latent_noise")}
+    assert [x.shape for x in noise.values()] == [(B, ACT), (B, ACT), (10, B, ACT), (B, 2 * ACT)]
+    whole = torch.cat([x.flatten() for x in noise.values()])
+    assert len(whole.unique()) > 0.99 * len(whole)
+    many = make_agent(PushedCPQ, batch_size=2_000).draw(
+        random_data(0), torch.Generator().manual_seed(4), LIMIT
+    )
+    for key in noise:
+        assert many[key].mean().item() == pytest.approx(0, abs=0.05)
+        assert many[key].std().item() == pytest.approx(1, abs=0.05)
+
+
+# --- What it learns ---
 
 
 def dataset(rows=200, low=-1.0, high=1.0, cost=0.4, terminal=False):
@@ -260,49 +240,18 @@ def dataset(rows=200, low=-1.0, high=1.0, cost=0.4, terminal=False):
     )
 
 
-@pytest.mark.parametrize("kind", [CPQ, PushedCPQ])
-@pytest.mark.parametrize("seeds", [(3,), (3, 5)])
-def test_a_resumed_run_draws_the_noise_that_it_would_have_drawn(kind, seeds, tmp_path, monkeypatch):
-    monkeypatch.setattr(training, "get_task", lambda name: TASK)
-    every = {"log_every": 1, "checkpoint_every": 10, "progress": False}
-    whole, first, second = (make_agent(kind, seeds) for _ in range(3))
-    training.train(whole, dataset(), steps=20, **every)
-    training.train(first, dataset(), steps=10, run_dir=tmp_path, **every)
-    training.train(second, dataset(), steps=20, run_dir=tmp_path, **every)
-    state = second.state()
-    for key, value in whole.state().items():
-        assert torch.equal(state[key], value), key
-
-
-def test_each_run_draws_its_noise_from_its_own_generator():
-    agent, seen = make_agent(PushedCPQ, seeds=(3, 4)), []
-    draw = agent.draw_noise
-    agent.draw_noise = lambda *args: seen.append(draw(*args)) or seen[-1]
-    generators = [torch.Generator().manual_seed(seed) for seed in (3, 4)]
-    agent.update(random_batch(0, runs=2, size=B), generators)
-    assert [x.shape for x in seen[0]] == [(B, ACT), (B, ACT), (10, B, ACT), (B, 2 * ACT)]
-    for seed, noises in zip((3, 4), seen, strict=True):
-        alone = draw(torch.Generator().manual_seed(seed), B)
-        assert all(torch.equal(x, y) for x, y in zip(noises, alone, strict=True))
-    for one, other in zip(*seen, strict=True):
-        assert not torch.equal(one, other)
-    assert not torch.equal(seen[0][0], seen[0][1])
-
-
-# --- What it learns ---
-
-
 def test_actions_outside_the_data_come_to_look_too_costly():
     """Episodes of one free step, actions in a corner: these stay cheap, those far away do not."""
     agent = make_agent(PushedCPQ, batch_size=64, hidden_width=32, critic_lr=1e-3, policy_lr=0.0)
     data = dataset(low=0.6, high=0.9, cost=0.0, terminal=True)
-    log = training.train(agent, data, steps=400, log_every=100, progress=False)
+    log = training.train(agent, data, updates=400, log_every=100, progress=False)
     limit = LIMIT * sum(0.8**t for t in range(T)) / T
     assert log[0]["outside_cost"] < 1.4 * limit < log[-1]["outside_cost"] < 1.8 * limit  # and no further
     with torch.no_grad():
-        s = agent.network_input(torch.tensor(data.observations), None)
-        recorded = agent.network("cost_critics")(s, torch.tensor(data.actions)).amin(0)
-        opposite = agent.network("cost_critics")(s, -torch.tensor(data.actions)).amin(0)
+        net = agent.networks(0)
+        s = agent.network_input(net, torch.tensor(data.observations), torch.tensor(LIMIT))
+        recorded = net.cost_critics(s, torch.tensor(data.actions)).amin(0)
+        opposite = net.cost_critics(s, -torch.tensor(data.actions)).amin(0)
     assert recorded.abs().mean() < 0.3 * limit and (opposite > limit).float().mean() > 0.9
 
 
@@ -324,12 +273,12 @@ def test_the_action_that_runs_is_the_squashed_mean_without_noise():
     randomise(agent, 3)
     observations = np.random.default_rng(1).normal(size=(5, OBS))
     slow = Slow(agent, 0)
-    inputs = (observations - slow.state["observation_mean"]) / slow.state["observation_std"]
-    expected = [slow.act(s, 0.0) for s in inputs]
+    expected = [slow.act(slow.inputs(s), 0.0) for s in observations]
     np.testing.assert_allclose(agent.act(observations, np.full(5, LIMIT)), expected, atol=1e-5)
     assert np.isnan(agent.predicted_cost(observations, np.full(5, LIMIT))).all()
 
 
-def test_an_infinite_threshold_is_refused():
-    with pytest.raises(ValueError, match="CPQ needs a finite threshold"):
-        make_agent(threshold=math.inf)
+@pytest.mark.parametrize("limits", [math.inf, (3.0, math.inf)])
+def test_an_infinite_limit_is_refused(limits):
+    with pytest.raises(ValueError, match="CPQ needs a finite limit"):
+        make_agent(seeds=(0, 1), limits=limits)

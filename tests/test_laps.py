@@ -1,16 +1,15 @@
 """The laps and the budget rule over them, against simulation, a loop over episodes, and hand-made cases."""
 
-import dataclasses
 import math
 
 import numpy as np
 import pytest
 
-from tutorial_lib.config import get_profile
+from tutorial_lib.costs.conditioning import ConditioningConfig
 from tutorial_lib.course import figures, laps, tabular, widgets
 from tutorial_lib.course.tabular.cmdp import draw
 
-CONFIG = dataclasses.replace(get_profile("paper"), infinite_at_test="never")
+CONFIG = ConditioningConfig.make("paper").changed(infinite_at_test="never")
 
 
 def test_the_goal_leads_back_to_the_start():
@@ -73,7 +72,7 @@ def test_what_is_told_by_hand():
     assert told[0, 0] == 25  # 20 is nearer to 25 than to 10
     assert told[50, 0] == 40  # all of the budget for half of the steps
     assert told[50, 20] == told[99, 100] == 10  # spent, and overspent
-    covered = laps.told(dataclasses.replace(CONFIG, infinite_at_test="covered"), 20)
+    covered = laps.told(CONFIG.changed(infinite_at_test="covered"), 20)
     assert math.isinf(covered[80, 0]) and covered[79, 0] == 40
 
 

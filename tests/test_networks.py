@@ -5,12 +5,11 @@ import math
 import numpy as np
 import pytest
 import torch
+from layers import relu_mlp, rounded_mlp
 from torch import nn
-from torch.func import stack_module_state, vmap
 
 from tutorial_lib.config import Config
 from tutorial_lib.networks import (
-    Borrower,
     Critics,
     EnsembleLinear,
     Output,
@@ -58,13 +57,6 @@ def test_values_are_one_number_per_state_and_heads_an_axis_more(batch):
     assert Critics(OBS, ACT, CONFIG, (3.0,), k=1)(s, a).shape == (1, batch, 1)
     mean, log_std = Policy(OBS, ACT, CONFIG)(s)
     assert mean.shape == (batch, ACT) and log_std.shape == (ACT,)
-
-
-def relu_mlp(x, weights, biases):
-    """Layer by layer, with nn.Linear's own weights (out, in)."""
-    for weight, bias in zip(weights[:-1], biases[:-1], strict=True):
-        x = (x @ weight.T + bias).clamp(min=0)
-    return x @ weights[-1].T + biases[-1]
 
 
 @pytest.mark.parametrize("scale", [250.0, SCALES])
@@ -161,40 +153,7 @@ def test_a_seed_names_a_network():
     assert not any(torch.equal(first[key], other[key]) for key in first)
 
 
-@pytest.mark.parametrize("runs", [1, 3])
-def test_a_borrower_computes_with_what_it_is_lent(runs):
-    """As torch.func.functional_call does, gradients too, for one set of parameters or for several at once."""
-    s, a = torch.randn(runs, B, OBS), torch.randn(runs, B, ACT)
-    nets = [Critics(OBS, ACT, CONFIG, SCALES) for _ in range(runs)]
-    parameters, _ = stack_module_state(nets)
-    borrower = Borrower(nets[0])
-    found = vmap(lambda p, *x: borrower.lend(p)(*x))(parameters, s, a)
-    expected = torch.stack([net(*x) for net, *x in zip(nets, s, a, strict=True)])
-    torch.testing.assert_close(found, expected)
-    weight = parameters["layers.0.weight"]
-    (gradient,) = torch.autograd.grad(found.square().sum(), weight)
-    own = [net.layers[0].weight for net in nets]
-    torch.testing.assert_close(gradient, torch.stack(torch.autograd.grad(expected.square().sum(), own)))
-    plain = {key: value[-1] for key, value in parameters.items()}
-    torch.testing.assert_close(borrower.lend(plain)(s[0], a[0]), nets[-1](s[0], a[0]))
-    assert not list(borrower.module.parameters()) and len(list(nets[0].parameters())) == len(plain)
-
-
 # --- bfloat16 ---
-
-
-def to_bfloat16(x):
-    """To the nearest number with 8 bits, of two equally near ones the even: by the bits of a float32."""
-    bits = x.numpy().astype(np.float32).view(np.uint32).astype(np.uint64)
-    bits = (bits + 0x7FFF + (bits >> 16 & 1)) & 0xFFFF0000
-    return torch.from_numpy(bits.astype(np.uint32).view(np.float32).astype(float))
-
-
-def rounded_mlp(x, weights, biases):
-    """`relu_mlp` where all that hidden layers read and say is rounded."""
-    for weight, bias in zip(weights[:-1], biases[:-1], strict=True):
-        x = to_bfloat16(to_bfloat16(x) @ to_bfloat16(weight).T + to_bfloat16(bias)).clamp(min=0)
-    return x @ weights[-1].T + biases[-1]
 
 
 def test_under_autocast_hidden_layers_round_and_outputs_do_not():
@@ -219,22 +178,6 @@ def test_under_autocast_hidden_layers_round_and_outputs_do_not():
         assert np.abs(found.numpy() - by_hand).mean() < 0.2 * size  # where sums lie between two numbers
         with torch.no_grad():
             np.testing.assert_allclose(network().numpy(), exact, atol=1e-5)
-
-
-def test_under_autocast_the_lift_adds_biases_in_float32():
-    config = Config(hidden_width=64, hidden_layers=1)
-    nets, s = [Policy(OBS, ACT, config) for _ in range(2)], torch.randn(200, OBS)
-    parameters, _ = stack_module_state(nets)
-    borrower = Borrower(nets[0])
-    with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
-        found = vmap(lambda p: borrower.lend(p).net(s))(parameters)
-    for net, actual in zip(nets, found, strict=True):
-        w1, b1, w2, b2 = (p.detach().double() for p in net.net.parameters())
-        products = to_bfloat16(to_bfloat16(s) @ to_bfloat16(w1).T)
-        by_hand = ((products + b1).clamp(min=0) @ w2.T + b2).numpy()
-        np.testing.assert_allclose(actual.numpy(), by_hand, atol=2e-3)
-        exact = relu_mlp(s.double(), (w1, w2), (b1, b2)).numpy()
-        assert np.abs(actual.numpy() - by_hand).mean() < 0.1 * np.abs(actual.numpy() - exact).mean()
 
 
 def test_a_network_without_hidden_layers_does_not_round():

@@ -1,8 +1,7 @@
 """Rollouts against loops by hand in the real simulator; scores and intervals against arithmetic."""
 
-import dataclasses
 import math
-import pickle
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -10,19 +9,20 @@ import pytest
 import torch
 
 from tutorial_lib.agents import get_algorithm
-from tutorial_lib.config import Config
 from tutorial_lib.playing import EPISODES_TOGETHER, evaluate, rollout
 from tutorial_lib.scores import normalised_cost, normalised_return, save_results, summarise, with_scores
 from tutorial_lib.tasks import TASKS, make_env
 
-CONFIG = Config(profile="test", hidden_width=16, hidden_layers=1, crm_width=8, crm_layers=1)
+OPTIONS = {"profile": "test", "hidden_width": 16, "hidden_layers": 1}
+RECONSTRUCTION = {"crm_width": 8, "crm_layers": 1}
 COLUMNS = "task algorithm profile seed threshold episode return cost length".split()
 
 
-def make_agent(name="C2IQL", task="BallRun", seeds=(0,), threshold=None, **changes):
+def make_agent(name="C2IQL", task="BallRun", seeds=(0,), limits=None, **changes):
     """An agent that nobody has trained, with weights so large that it moves, and heeds its limit."""
-    config = dataclasses.replace(CONFIG, **changes)
-    agent = get_algorithm(name)(TASKS[task], config, seeds=seeds, threshold=threshold)
+    kind = get_algorithm(name)
+    options = OPTIONS | (RECONSTRUCTION if hasattr(kind.Config, "crm") else {})
+    agent = kind(TASKS[task], kind.Config(**options | changes), seeds, limits)
     generator = torch.Generator().manual_seed(3)
     for value in agent.parameters["policy"].values():
         value.data = 1.5 * torch.randn(value.shape, generator=generator)
@@ -89,7 +89,7 @@ def test_every_step_is_that_of_a_loop_by_hand_under_the_budget_rule(time_limits,
     spent = [0.0] * 6
     for t in range(100):
         given = [budget_rule(limits[e], spent[e], t, agent.task, agent.config) for e in range(6)]
-        assert played.conditions[t].tolist() == given
+        assert played.told[t].tolist() == given
         if t == 0:
             expected = agent.predicted_cost(np.stack(observations), np.array(given), run)
             np.testing.assert_array_equal(played.predicted_costs, expected)
@@ -100,17 +100,98 @@ def test_every_step_is_that_of_a_loop_by_hand_under_the_budget_rule(time_limits,
             assert (played.rewards[t, e], played.costs[t, e]) == (reward, info["cost"])
             assert played.positions[t, e].tolist() == list(env.position)
     assert played.lengths.tolist() == [100] * 6
-    assert 20 < max(spent) and len(np.unique(played.conditions)) > 2  # or little was shown
+    assert 20 < max(spent) and len(np.unique(played.told)) > 2  # or little was shown
 
 
-def test_an_agent_without_conditions_is_given_none_and_keeps_its_own_threshold():
-    agent = make_agent("CIQL", threshold=30.0)
+def test_the_budget_player_tells_what_is_left_and_rewards_change_nothing():
+    """The player of C2IQL alone, without a simulator: told, act, see, over a few steps."""
+    agent, limits = make_agent(infinite_at_test="never", zero_threshold=True), [30.0, 70.0]
+    player = agent.player(limits, seeds=[0, 1])
+    observations = np.random.default_rng(0).normal(size=(2, 7))
+    spent = np.zeros(2)
+    for t, costs in enumerate(([1, 0], [29, 0], [0, 40], [5, 0])):
+        expected = [budget_rule(limits[e], spent[e], t, agent.task, agent.config) for e in (0, 1)]
+        assert player.told.tolist() == expected
+        np.testing.assert_array_equal(player.act(observations), agent.act(observations, np.array(expected)))
+        found = player.predicted_cost(observations)
+        np.testing.assert_array_equal(found, agent.predicted_cost(observations, np.array(expected)))
+        player.see(np.full(2, 1e6), np.array(costs, float))
+        spent += costs
+    assert spent.tolist() == [35, 40] and player.told.tolist() == [0, 30]
+
+
+def test_an_agent_that_is_trained_for_one_limit_is_told_none():
+    agent = make_agent("CIQL", limits=30.0)
     played = rollout(agent, 30, [1, 2])
-    assert np.isnan(played.conditions).all() and np.isnan(played.predicted_costs).all()
+    assert np.isnan(played.told).all() and np.isnan(played.predicted_costs).all()
     assert set(evaluate(agent, episodes=2)["threshold"]) == {30.0}
     with pytest.raises(ValueError, match="trained for the limit 30, and can be told no other"):
         evaluate(agent, (50, 70), episodes=2)
-    assert np.isfinite(rollout(make_agent("C2IQL w/o CC", threshold=30.0), 30, [1]).predicted_costs).all()
+    assert np.isfinite(rollout(make_agent("C2IQL w/o CC", limits=30.0), 30, [1]).predicted_costs).all()
+
+
+def test_every_run_plays_under_the_limit_that_it_was_trained_for():
+    agent = make_agent("CIQL", seeds=(0, 4, 0), limits=(30.0, 30.0, 70.0))
+    results = evaluate(agent, episodes=2)
+    keys = list(results[["seed", "threshold", "episode"]].itertuples(index=False, name=None))
+    assert keys == [(s, limit, e) for s, limit in ((0, 30), (4, 30), (0, 70)) for e in (0, 1)]
+    for run, seed in enumerate(agent.seeds):
+        played = rollout(agent, agent.limits[run], [1000 * (seed + 1), 1000 * (seed + 1) + 1], run)
+        assert results["return"][2 * run : 2 * run + 2].tolist() == played.rewards.sum(0).tolist()
+    pd.testing.assert_frame_equal(evaluate(agent, (70, 30), episodes=2), results)
+    with pytest.raises(ValueError, match="trained for the limit 30, 70, and can be told no other"):
+        evaluate(agent, (30,), episodes=2)
+
+
+class Scripted:
+    """Stands in for a player: it says something else at every step, and writes down what it hears."""
+
+    def __init__(self, limits, seeds, run):
+        self.made_with, self.heard, self.t = (list(limits), list(seeds), run), [], 0
+
+    @property
+    def told(self):
+        return np.array([100.0 + self.t, 200.0 + self.t])
+
+    def act(self, observations):
+        self.heard.append(("act", observations.copy()))
+        weights = np.random.default_rng(0).normal(size=(17, 4))
+        return np.tanh(observations @ (4 * weights))  # so rough that a drone falls
+
+    def see(self, rewards, costs):
+        self.heard.append(("see", rewards.copy(), costs.copy()))
+        self.t += 1
+
+    def predicted_cost(self, observations):
+        assert not self.heard  # before the first step
+        return observations[:, 0] + 7.0
+
+
+def test_a_rollout_knows_nothing_of_limits_but_what_the_player_says():
+    """It asks the player and tells it what happened, step by step; after a fall it reports zeros."""
+    made = []
+
+    def player(limits, seeds, run):
+        made.append(Scripted(limits, seeds, run))
+        return made[-1]
+
+    agent = SimpleNamespace(task=TASKS["DroneRun"], player=player)
+    played = rollout(agent, [30, math.inf], [5, 6], run=3)
+    (scripted,) = made
+    assert scripted.made_with == ([30.0, math.inf], [5, 6], 3)
+    steps = max(played.lengths)
+    assert min(played.lengths) < steps < 200  # both fall, one of them first
+    assert [word for word, *_ in scripted.heard] == ["act", "see"] * steps
+    first = [make_env("DroneRun").reset(seed=seed)[0] for seed in (5, 6)]
+    np.testing.assert_array_equal(scripted.heard[0][1], first)
+    np.testing.assert_array_equal(played.predicted_costs, np.stack(first)[:, 0] + 7.0)
+    for t in range(steps):
+        assert played.told[t].tolist() == [100 + t, 200 + t]
+        np.testing.assert_array_equal(scripted.heard[2 * t + 1][1], played.rewards[t])
+        np.testing.assert_array_equal(scripted.heard[2 * t + 1][2], played.costs[t])
+    assert np.isnan(played.told[steps:]).all()  # nobody plays any more
+    for e, length in enumerate(played.lengths):
+        assert not played.rewards[length:, e].any() and played.rewards[:length, e].all()
 
 
 def test_an_episode_that_ends_early_leaves_zeros():
@@ -120,7 +201,7 @@ def test_an_episode_that_ends_early_leaves_zeros():
     observations = np.stack([env.reset(seed=seed)[0] for env, seed in zip(envs, seeds, strict=True)])
     lengths = [None] * len(seeds)
     for t in range(200):
-        chosen = agent.act(observations, played.conditions[t])
+        chosen = agent.act(observations, played.told[t])
         for e, env in enumerate(envs):
             if lengths[e] is None:
                 observations[e], reward, terminated, truncated, _ = env.step(chosen[e])
@@ -154,10 +235,10 @@ def test_results_are_the_sums_of_the_rollouts():
 
 
 @pytest.mark.parametrize("bad", [-1, -0.001, math.nan])
-def test_a_threshold_that_is_none_is_refused(bad):
-    with pytest.raises(ValueError, match="threshold must be zero or more"):
+def test_a_limit_that_is_none_is_refused(bad):
+    with pytest.raises(ValueError, match="limit on the cost must be zero or more"):
         rollout(make_agent(), [30, bad], [0, 1])
-    with pytest.raises(ValueError, match="threshold must be zero or more"):
+    with pytest.raises(ValueError, match="limit on the cost must be zero or more"):
         evaluate(make_agent(), (30, bad), episodes=1)
 
 
@@ -261,11 +342,3 @@ def test_a_write_that_breaks_off_leaves_the_old_results(tmp_path):
     with pytest.raises(OSError, match="space"):
         save_results(Broken(), path)
     assert path.read_text() == "old"
-
-
-def test_a_worker_is_sent_no_optimiser():
-    """The moments are twice the networks' size, and are of no use to play."""
-    agent = make_agent(seeds=(0, 1))
-    sent = pickle.loads(pickle.dumps(agent))
-    assert "optimiser" in vars(agent) and "optimiser" not in vars(sent)
-    assert same(rollout(sent, 30, [1, 2], run=1), rollout(agent, 30, [1, 2], run=1))

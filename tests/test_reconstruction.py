@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import torch
 
-from tutorial_lib.config import Config
 from tutorial_lib.costs import reconstruction
 from tutorial_lib.costs.reconstruction import (
     CostReconstruction,
+    ReconstructionConfig,
     episode_sums,
     random_sums,
     reconstruction_error,
@@ -23,7 +23,7 @@ from tutorial_lib.tasks import TASKS
 
 T, GAMMAS = 20, (0.8, 0.85, 0.9)
 TASK = dataclasses.replace(TASKS["BallRun"], horizon=T, gammas=GAMMAS)
-SMALL = Config(crm_width=32, crm_layers=2, crm_steps=1500, batch_size=128)
+SMALL = ReconstructionConfig(crm_width=32, crm_layers=2, crm_steps=1500, batch_size=128)
 LINEAR = dataclasses.replace(SMALL, crm="linear")
 
 
@@ -120,7 +120,9 @@ def test_a_model_takes_any_batch_and_the_seeds_of_a_run_beside_it():
 
 
 def test_the_papers_model_has_five_hidden_layers_of_512():
-    linear = [m for m in CostReconstruction(TASK, Config()).net if isinstance(m, torch.nn.Linear)]
+    linear = [
+        m for m in CostReconstruction(TASK, ReconstructionConfig()).net if isinstance(m, torch.nn.Linear)
+    ]
     assert [(m.in_features, m.out_features) for m in linear] == [(3, 512)] + [(512, 512)] * 4 + [(512, 1)]
 
 

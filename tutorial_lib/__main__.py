@@ -1,17 +1,20 @@
 """The command line: `c2iql tasks | collect | fetch | train | evaluate | study | report`.
 
 tyro turns functions and dataclasses into commands with help and types, so no option is written twice.
-Everything
-else is imported inside the commands: `c2iql --help` answers at once.
+Everything else is imported inside the commands: `c2iql --help` answers at once.
 """
 
 import dataclasses
+import functools
 import sys
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
+
+if TYPE_CHECKING:
+    from tutorial_lib.studies.runs import Runs
 
 Device = Literal["cpu", "cuda"]
 
@@ -79,8 +82,8 @@ def train(words: tuple[str, ...] = ()) -> None:
     """Train an agent and save it with its log: `c2iql train [ALGORITHM] TASK [options]`.
 
     Several seeds train together. A killed run continues where it was. Without options it makes the agent of
-    the results' table. `c2iql train ALGORITHM --help` shows all options of an algorithm; without ALGORITHM it
-    is C2IQL.
+    the results' table. `c2iql train ALGORITHM --help` shows all options of an algorithm; the default is
+    C2IQL.
     """
     from tutorial_lib import checkpoints, training
     from tutorial_lib.agents import slug
@@ -159,38 +162,66 @@ def study(
         scheduler: address of a dask scheduler; default one process for each core of this machine.
         workers: processes on this machine.
         profile: of every run.
-        option: changes to every run, for a trial, e.g. updates=200 crm_steps=100.
+        option: changes to every run that has this option, for a trial, e.g. updates=200 crm_steps=100.
         data: shipped, or dsrl.
         runs: folder of all studies' runs.
         out: the CSV to write; default data/results/NAME.csv, and in a trial runs/studies/NAME.csv.
         dry: only list the entries, and which of them are finished.
     """
-    from tutorial_lib.options import with_options
-    from tutorial_lib.studies import cluster, grids, results
-    from tutorial_lib.studies import runs as of_study
-
     check_counts(workers=workers)
-    record, folder = grids.get_study(name), runs / name
-    settings: dict[str, Any] = {"change": lambda config: with_options(config, option)}
-    settings |= {"profile": profile, "data": data}
-    grid, chosen = grids.entries(record, **settings), grids.entries(record, only, **settings)
+    question, whole, chosen = _entries(name, only, profile, option, data)
     trial = bool(option) or profile != "small" or data != "shipped"
-    out = out or (runs / f"{name}.csv" if trial else results.RESULTS / f"{name}.csv")
-    print(record.question)
+    print(question)
     if dry:
-        for entry in chosen:
-            print("done   " if of_study.results_path(entry, folder).exists() else "waiting", entry.name)
-        return
+        _list_entries(chosen, runs / name)
+    else:
+        _run_entries(whole, chosen, runs / name, out, trial, scheduler, workers)
+
+
+def _entries(
+    name: str, only: str, profile: str, option: tuple[str, ...], data: str
+) -> tuple[str, list["Runs"], list["Runs"]]:
+    """A study's question, all of its entries, and those that are to be run."""
+    from tutorial_lib.options import with_options
+    from tutorial_lib.studies import grids
+
+    record = grids.get_study(name)
+    change = functools.partial(with_options, options=option, others=grids.options_of(record))
+    whole, chosen = (grids.entries(record, fits, change, profile, data) for fits in ("*", only))
+    return record.question, whole, chosen
+
+
+def _list_entries(chosen: list["Runs"], folder: Path) -> None:
+    """Print which entries are finished."""
+    from tutorial_lib.studies.runs import results_path
+
+    for entry in chosen:
+        print("done   " if results_path(entry, folder).exists() else "waiting", entry.name)
+
+
+def _run_entries(
+    whole: list["Runs"],
+    chosen: list["Runs"],
+    folder: Path,
+    out: Path | None,
+    trial: bool,
+    scheduler: str | None,
+    workers: int | None,
+) -> None:
+    """Run entries, and gather the results of the whole study. Raises ValueError where some failed."""
+    from tutorial_lib.studies import cluster, results
+    from tutorial_lib.studies.runs import collect as gather
+
+    out = out or (folder.parent if trial else results.RESULTS) / f"{folder.name}.csv"
     with cluster.connect(scheduler, workers) as client:
         failures = cluster.run_all(chosen, folder, client)
-    done = of_study.collect(grid, folder, out, keep=not trial)
-    print(f"{out}: {done} of {len(grid)} entries are finished here")
-    for failed, reason in failures.items():
-        print(f"FAILED {failed}: {reason}")
+    done = gather(whole, folder, out, keep=not trial)
+    print(f"{out}: {done} of {len(whole)} entries are finished here")
+    for entry, reason in failures.items():
+        print(f"FAILED {entry}: {reason}")
     if failures:
-        raise ValueError(
-            f"{len(failures)} of {len(chosen)} entries failed; run the study again to try them again"
-        )
+        some = f"{len(failures)} of {len(chosen)} entries failed"
+        raise ValueError(f"{some}; run the study again to try them again")
 
 
 def report(name: tyro.conf.Positional[str | None] = None) -> None:
@@ -234,7 +265,7 @@ def main() -> None:
         return
     commands = {f.__name__: f for f in (tasks, collect, fetch, train, evaluate, study, report)}
     try:
-        if words[:1] == ["train"] and words[1:] not in ([], ["--help"], ["-h"]):
+        if words[:1] == ["train"]:  # its options depend on its first words
             train(tuple(words[1:]))
         else:
             tyro.extras.subcommand_cli_from_dict(

@@ -1,4 +1,4 @@
-"""Files of agents: an agent to use, and a checkpoint from which training goes on."""
+"""Reads and writes the files of agents: agents that act, and checkpoints to continue training from."""
 
 import csv
 import dataclasses
@@ -14,22 +14,25 @@ from tutorial_lib.files import written_whole
 from tutorial_lib.tasks import get_task
 
 CHECKPOINT = "checkpoint.safetensors"
-
-
+"""The file of a run's folder from which training continues."""
 METRICS = "metrics.csv"
+"""The file of a run's folder with the log of its training."""
 
 
 class TrainingError(ValueError):
-    """Training cannot go on: what happened, when, and what to try."""
+    """Training cannot continue. The message says what happened and what to do."""
 
 
 def save_agent(agent: Agent, path: Path) -> None:
-    """An agent to use: its networks, without what only training needs. Atomic."""
+    """Writes an agent that can act: its networks and variables, without the tensors that only training needs.
+
+    The file is written as a whole or not at all. Raises OSError if it cannot be written.
+    """
     _save(agent, path, {k: v for k, v in agent.state().items() if not k.startswith(("adam.", "target."))})
 
 
 def _save(agent: Agent, path: Path, tensors: dict[str, torch.Tensor]) -> None:
-    """Tensors, with what is needed to build their agent again in the file's header."""
+    """Writes tensors to a file whose header has everything that is needed to build their agent again."""
     header = {
         "task": agent.task.name,
         "algorithm": agent.name,
@@ -42,8 +45,11 @@ def _save(agent: Agent, path: Path, tensors: dict[str, torch.Tensor]) -> None:
         save_file({k: value.cpu().contiguous() for k, value in tensors.items()}, temporary, metadata=header)
 
 
-def load_agent(path: Path | str, device="cpu") -> Agent:
-    """The agent that `save_agent` wrote. Raises TrainingError for a file that is not one, or is damaged."""
+def load_agent(path: Path | str, device: torch.device | str = "cpu") -> Agent:
+    """Returns the agent of a file that `save_agent` or `save_checkpoint` wrote, ready to act.
+
+    Raises TrainingError if there is no such file, if it is not the file of an agent, or if it is damaged.
+    """
     path = Path(path)
     if path.is_dir():
         raise TrainingError(f"{path}: is a folder: name the agent.safetensors in it")
@@ -64,15 +70,19 @@ def load_agent(path: Path | str, device="cpu") -> Agent:
     except FileNotFoundError:
         raise TrainingError(f"{path}: no such file: train an agent with `c2iql train`") from None
     except (OSError, SafetensorError, KeyError, TypeError, ValueError, RuntimeError) as error:
-        reason = " ".join(str(error).split())  # PyTorch's take several lines
+        reason = " ".join(str(error).split())  # PyTorch's messages can have several lines
         raise TrainingError(
-            f"{path}: not an agent of this version, or damaged: train it again ({reason})"
+            f"{path}: this is not an agent of this version, or it is damaged: train it again ({reason})"
         ) from error
     return agent
 
 
 def save_checkpoint(agent: Agent, generators: list[torch.Generator], log: list[dict], run_dir: Path) -> None:
-    """metrics.csv first, then the checkpoint that vouches for it: a kill in between loses nothing."""
+    """Writes the log to metrics.csv, and then everything that training needs to checkpoint.safetensors.
+
+    In this order nothing is lost if the process is killed between the two. `generators` has one generator per
+    run. Raises OSError if a file cannot be written.
+    """
     states = {f"generator.{run}": generator.get_state() for run, generator in enumerate(generators)}
     with written_whole(run_dir / METRICS) as temporary, open(temporary, "w", newline="") as file:
         writer = csv.DictWriter(file, fieldnames=list(log[0]) if log else ["update"])
@@ -82,7 +92,11 @@ def save_checkpoint(agent: Agent, generators: list[torch.Generator], log: list[d
 
 
 def resume(agent: Agent, generators: list[torch.Generator], run_dir: Path) -> list[dict]:
-    """Bring agent and generators to the state of the folder's checkpoint; returns the log up to there."""
+    """Gives agent and generators the state of the folder's checkpoint, and returns the log up to that update.
+
+    Raises TrainingError if the checkpoint is of another run or of other data, or if a file is missing or
+    damaged.
+    """
     path = run_dir / CHECKPOINT
     saved = load_agent(path)
     mine = (agent.task, agent.name, agent.config, agent.seeds, agent.limits)

@@ -1,8 +1,7 @@
-"""Options: what every run has. An algorithm's own options stand in its file, in a class derived from
-`Config`.
+"""The options that every algorithm has. An algorithm's file derives a class from `Config` for its own.
 
-Every option has a type, a default (profile `paper`), bounds and a sentence. `c2iql train ALGORITHM --help`
-shows them, and the file of an agent keeps them.
+Every option has a type, a default (that of profile `paper`), a bound on its numbers and a description.
+`c2iql train ALGORITHM --help` shows them, and the file of an agent stores their values.
 """
 
 import dataclasses
@@ -12,57 +11,59 @@ from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self, get_args
 
 
 class Bound(NamedTuple):
-    """What a number must fulfil."""
+    """A condition on the number that an option may have."""
 
     holds: Callable[[float], bool]
+    """Returns whether a number fulfils the condition."""
     words: str
+    """The condition in words, for an error message."""
 
 
 SHARE = Bound(lambda x: 0 < x < 1, "between 0 and 1")
-STEP = Bound(lambda x: 0 < x <= 1, "above 0, and 1 at most")
+STEP = Bound(lambda x: 0 < x <= 1, "above 0 and at most 1")
 NOT_NEGATIVE = Bound(lambda x: x >= 0, "0 or more")
 COUNT = Bound(lambda x: x >= 1, "1 or more")
 PAIR = Bound(lambda x: x >= 2, "2 or more")
 
 PROFILES = ("paper", "small")
-"""`paper`: the sizes of the paper. `small`: trains in minutes on a laptop."""
+"""Two sets of defaults: `paper` has the sizes of the paper, and `small` trains in minutes on a laptop."""
 
 
 @dataclass(frozen=True)
 class Config:
     """The options of every algorithm. The defaults are profile `paper` (Table 4 and Appendix B.2).
 
-    Raises ValueError for a word or a number that means nothing where it stands.
+    Raises ValueError for a value of another type, an unknown word, or a number out of its bound.
     """
 
     profile: str = "paper"
-    """The name that results files carry."""
+    """The name of the profile. Results files contain it."""
     updates: Annotated[int, COUNT] = 400_000
-    """Gradient updates (Table 4)."""
+    """The number of gradient updates of a run (Table 4)."""
     batch_size: Annotated[int, PAIR] = 512
-    """Transitions per update (Table 4)."""
+    """The number of transitions per update (Table 4)."""
     policy_lr: Annotated[float, NOT_NEGATIVE] = 3e-4
     """Adam's learning rate for the policy (Table 4)."""
     hidden_width: Annotated[int, COUNT] = 256
-    """Units of each hidden layer. The paper says that the structure follows IQL."""
+    """The number of units of each hidden layer. The paper says that the structure follows IQL."""
     hidden_layers: Annotated[int, NOT_NEGATIVE] = 2
-    """Hidden layers of each network; 0: a linear network."""
+    """The number of hidden layers of each network. With 0 the network is linear."""
     normalise_observations: bool = True
-    """Give the networks observations of mean zero and variance one. The paper does not say whether it
-    does."""
+    """If true, observations are scaled to mean zero and variance one. The paper does not say whether it does
+    this."""
     precision: Literal["float32", "bfloat16"] = "float32"
-    """The numbers that hidden layers multiply while training. With bfloat16, inputs, outputs and gradients of
-    hidden layers have 8-bit mantissas; last layers, losses, parameters, Adam, the reconstruction model's
-    training and acting stay in float32. It is faster in profile `paper` on a CPU with AVX512_BF16. It has not
-    been run with AMX or on a GPU."""
+    """The number format in which hidden layers multiply during training. With bfloat16, the inputs, outputs
+    and gradients of hidden layers have 8-bit mantissas. Last layers, losses, parameters, Adam, the training
+    of the reconstruction model and acting stay in float32. Training with bfloat16 is faster in profile
+    `paper` on a CPU with AVX512_BF16. It has not been run with AMX or on a GPU."""
 
     profiles: ClassVar[Mapping[str, Mapping[str, Any]]] = {
-        # A laptop's size: a seventh of the arithmetic per transition, half the batch, one update in 33.
+        # Sizes for a laptop: 1/7 of the arithmetic per transition, 1/2 of the batch and 1/33 of the updates.
         "small": {"updates": 12_000, "batch_size": 256, "hidden_width": 128, "policy_lr": 1e-3},
     }
-    """What a profile changes in the defaults of this class. A derived class adds its own changes."""
+    """The values that a profile changes in the defaults of this class. A derived class adds its own."""
     tasks: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
-    """What a task changes in profile `small`, by the task's name."""
+    """The values that a task changes in profile `small`, by the name of the task."""
 
     def __post_init__(self):
         for name, hint in get_type_hints(type(self), include_extras=True).items():
@@ -71,7 +72,10 @@ class Config:
 
     @classmethod
     def make(cls, profile: str = "small", task: str | None = None) -> Self:
-        """The options of a profile, with those of a task's own where one is named. Raises ValueError."""
+        """Returns the options of a profile. In profile `small`, a task's own values are among them.
+
+        Raises ValueError for an unknown profile.
+        """
         if profile not in PROFILES:
             raise ValueError(f"unknown profile {profile!r}: the profiles are {', '.join(PROFILES)}")
         changes: dict[str, Any] = {"profile": profile}
@@ -82,15 +86,18 @@ class Config:
         return cls(**changes)
 
     def changed(self, **changes: Any) -> Self:
-        """These options with other values of some. Raises ValueError for a name that is not among them."""
+        """Returns these options with other values for some of them.
+
+        Raises ValueError for an unknown name, or for a value that the option cannot have.
+        """
         names = [field.name for field in dataclasses.fields(self)]
         if unknown := [name for name in changes if name not in names]:
-            raise ValueError(f"no option {', '.join(unknown)} here: the options are {', '.join(names)}")
-        return dataclasses.replace(self, **changes)  # all at once: what fits together may come in any order
+            raise ValueError(f"unknown option {', '.join(unknown)}: the options are {', '.join(names)}")
+        return dataclasses.replace(self, **changes)  # all at once, because some values fit only together
 
 
 def _check(name: str, hint: Any, value: Any) -> None:
-    """ValueError where the value is none of a Literal's words, of another type, or out of its bound."""
+    """Raises ValueError for a value of another type, an unknown word, or a number out of its bound."""
     bounds: tuple = ()
     if get_origin(hint) is Annotated:
         hint, *rest = get_args(hint)

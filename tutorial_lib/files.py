@@ -1,4 +1,4 @@
-"""Writing files: whole or not at all."""
+"""Files are written as a whole or not at all."""
 
 import contextlib
 import os
@@ -11,19 +11,19 @@ from safetensors import SafetensorError
 
 @contextlib.contextmanager
 def written_whole(path: Path) -> Iterator[Path]:
-    """Write to the path that this yields: it takes the place of `path` when the block ends without an error.
+    """Yields a temporary path to write to. It replaces `path` when the block ends without an error.
 
-    Whoever looks finds the old file or the new one, whole, also after a crash. Makes the folders above.
-    Raises OSError where there is no room or no permission.
+    A reader finds the whole old file or the whole new file, also after a crash. Missing folders are made.
+    Raises OSError where there is no space or no permission.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")  # no other machine's, either
+    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")  # unique, also among several machines
     try:
         yield temporary
         with open(temporary, "rb+") as file:
             os.fsync(file.fileno())
         os.replace(temporary, path)
-    except SafetensorError as error:  # what it makes of a full disk
+    except SafetensorError as error:  # the error of a full disk
         raise OSError(f"{path}: {error}") from error
     finally:
         temporary.unlink(missing_ok=True)

@@ -2,11 +2,14 @@
 table."""
 
 import ast
+import contextlib
 import dataclasses
 import inspect
+import io
+import itertools
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_type_hints
 
 import tyro
 
@@ -35,19 +38,18 @@ class Training:
     """Where to train."""
 
 
-def parse_training(words: list[str]) -> tuple[type[Agent], Training]:
-    """The algorithm and the arguments of `c2iql train`. The profile and the task decide the options'
-    defaults."""
-    known = {*ALGORITHMS, *map(slug, ALGORITHMS)}
-    two_words = len(words) > 1 and not words[1].startswith("-") and not words[0].startswith("-")
-    name = words.pop(0) if words and (words[0] in known or two_words) else "C2IQL"
-    kind = get_algorithm(name)
+def parse_training(words: Sequence[str]) -> tuple[type[Agent], Training]:
+    """The algorithm and the arguments of `c2iql train [ALGORITHM] TASK [options]`.
+
+    The algorithm, the profile and the task decide the options' defaults. Raises ValueError for a name that is
+    unknown, and where the task does not stand before the options.
+    """
+    words = list(words)
+    names = {*ALGORITHMS, *map(slug, ALGORITHMS)}
+    two_names = len(words) > 1 and not any(word.startswith("-") for word in words[:2])
+    kind = get_algorithm(words.pop(0) if two_names or set(words[:1]) & names else "C2IQL")
     task = get_task(words[0]) if words and not words[0].startswith("-") else None
-    profile = "small"
-    for word, following in zip(words, [*words[1:], ""], strict=True):
-        if word == "--profile" or word.startswith("--profile="):
-            profile = following if word == "--profile" else word.partition("=")[2]
-    default = kind.configure(profile, task)
+    default = kind.configure(_profile(words), task)
     options = dataclasses.make_dataclass(
         "Options",
         [("config", Annotated[kind.Config, tyro.conf.OmitArgPrefixes], dataclasses.field(default=default))],
@@ -55,29 +57,51 @@ def parse_training(words: list[str]) -> tuple[type[Agent], Training]:
         frozen=True,
         kw_only=True,
     )
-    options.__doc__ = f"Train {kind.name}.\n\n{(kind.__doc__ or '').strip()}"
-    return kind, tyro.cli(options, args=words, prog=f"c2iql train {slug(kind.name)}")
+    options.__doc__ = (
+        f"Train {kind.name} and save it with its log.\n\n{(kind.__doc__ or '').strip()}\n\n"
+        f"Other algorithms: c2iql train ALGORITHM --help, with one of {', '.join(map(slug, ALGORITHMS))}."
+    )
+    args: Any = tyro.cli(options, args=words, prog=f"c2iql train {slug(kind.name)}")
+    if task is None:  # the defaults would lack the task's own options
+        raise ValueError("write the task before the options: c2iql train [ALGORITHM] TASK [options]")
+    return kind, args
 
 
-def with_options(config: Config, options: Sequence[str]) -> Config:
-    """The config with `NAME=VALUE` changes; values are read as the option's own type. Raises ValueError."""
+def _profile(words: Sequence[str]) -> str:
+    """The last profile that is named in `words`, or `small`."""
+    profile = "small"
+    for word, following in itertools.pairwise([*words, ""]):
+        if word == "--profile":
+            profile = following or profile  # tyro reports a missing name
+        elif word.startswith("--profile="):
+            profile = word.partition("=")[2]
+    return profile
+
+
+def with_options(config: Config, options: Sequence[str], others: Sequence[str] = ()) -> Config:
+    """The config with changes that are written `NAME=VALUE`.
+
+    A value is read as the option's own type. A change of an option that only `others` have is left out: a
+    study's algorithms do not read the same options. Raises ValueError.
+    """
+    types = get_type_hints(type(config))
+    own = [field.name for field in dataclasses.fields(config)]
+    names = [name for name in dict.fromkeys([*own, *others]) if name != "profile"]
     changes = {}
     for option in options:
         name, equals, text = option.partition("=")
-        if not equals:
-            raise ValueError(f"--option {option}: write NAME=VALUE")
-        flag = f"--{name.replace('_', '-')}"
-        if name not in (names := [field.name for field in dataclasses.fields(config)]):
+        if not equals or name not in names:
             raise ValueError(f"--option {option}: write NAME=VALUE with one of {', '.join(names)}")
+        if name not in own:
+            continue
+        said = io.StringIO()  # tyro's message is about another command line
         try:
-            parsed = tyro.cli(type(config), args=[flag, text], default=config, console_outputs=False)
+            with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+                changes[name] = tyro.cli(types[name], args=[text])
         except SystemExit:
-            kind = type(getattr(config, name)).__name__
-            raise ValueError(
-                f"--option {option}: the value must be like {getattr(config, name)!r} ({kind})"
-            ) from None
-        changes[name] = getattr(parsed, name)
-    return config.changed(**changes)
+            kind = "True or False" if types[name] is bool else inspect.formatannotation(types[name])
+            raise ValueError(f"--option {option}: the value must be {kind}") from None
+    return config.changed(**changes)  # all at once: what fits together may come in any order
 
 
 def describe(kind: type[Config]) -> dict[str, str]:

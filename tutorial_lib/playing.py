@@ -1,4 +1,4 @@
-"""Agents in the simulator: rollouts under the budget rule, and the raw results of an evaluation."""
+"""Plays agents in the simulator, episode by episode, and returns the raw results of an evaluation."""
 
 import functools
 from collections.abc import Sequence
@@ -14,29 +14,35 @@ from tutorial_lib.costs.conditioning import check_limit
 from tutorial_lib.tasks import make_env
 
 EPISODES_TOGETHER = 10
-"""Episodes that share one process and one call of the policy. Results do not depend on the number of
-workers because it is fixed: a product of matrices may round a row differently in a batch of another size."""
+"""The number of episodes that share one process and one call of the policy. It is fixed, so that results do
+not depend on the number of workers: a matrix product can round differently in a batch of another size."""
 
 
 class Rollout(NamedTuple):
-    """E episodes of at most T steps, step by step; after an episode's end its rows are zero."""
+    """E episodes of at most T steps. Rewards, costs and positions are zero after the end of an episode."""
 
     rewards: np.ndarray
-    """(T, E)"""
+    """(T, E): the reward of each step."""
     costs: np.ndarray
-    """(T, E), 0 or 1"""
+    """(T, E): the cost of each step, 0 or 1."""
     told: np.ndarray
-    """(T, E): the limit that the policy was told at each step (NaN: the policy takes none)"""
+    """(T, E): the limit that the policy was told at each step. It is NaN if the policy takes none."""
     positions: np.ndarray
-    """(T, E, 2): where the robot was, in metres"""
+    """(T, E, 2): the position of the robot after each step, in metres."""
     lengths: np.ndarray
-    """(E,): steps until the robot fell or the horizon was reached"""
+    """(E,): the number of steps until the robot fell or the horizon was reached."""
     predicted_costs: np.ndarray
-    """(E,): the cost that the critics expected at the first step (NaN: they cannot tell)"""
+    """(E,): the cost of the episode that the critics predicted at its first step, or NaN."""
 
 
-def rollout(agent: Agent, limits, seeds: Sequence[int], run: int = 0) -> Rollout:
-    """Play one episode per seed with run number `run`, all at once, each under its limit."""
+def rollout(
+    agent: Agent, limits: float | Sequence[float] | np.ndarray, seeds: Sequence[int], run: int = 0
+) -> Rollout:
+    """Plays one episode per seed, all at once, with the run number `run` of the agent.
+
+    `limits` is one limit for all episodes, or one per episode, (E,), in cost per episode. Raises ValueError
+    for a limit that is negative or NaN.
+    """
     task, count = agent.task, len(seeds)
     limits = np.array([check_limit(limit) for limit in np.broadcast_to(limits, count)])
     player, envs = agent.player(limits, seeds, run), _environments(task.name, count)
@@ -68,11 +74,12 @@ def evaluate(
     workers: int = 1,
     seeds: Sequence[int] | None = None,
 ) -> pd.DataFrame:
-    """Raw results: one row per run, limit and episode, by default under the task's own limits.
+    """Returns the raw results: one row per run, limit and episode.
 
-    The episodes of a seed start alike under every limit. More workers give the same rows, sooner. `seeds`:
-    only the runs with these seeds. Raises ValueError for a limit that the agent was not trained for and
-    cannot be told.
+    The default limits are those that a run was trained for, or else the task's own. The episodes of a run
+    start in the same states under every limit. The rows do not depend on the number of workers. With `seeds`,
+    only the runs with these seeds play. Raises ValueError for a limit that is negative, or that the agent was
+    not trained for and cannot be told.
     """
     jobs = [
         (run, limit, range(first, min(first + EPISODES_TOGETHER, episodes)))
@@ -86,7 +93,7 @@ def evaluate(
 
 
 def _limits_of(agent: Agent, run: int, limits: Sequence[float] | None) -> Sequence[float]:
-    """The limits that a run plays under: those asked for, its own, or the task's."""
+    """Returns the limits that a run plays under: those asked for, its own, or the task's."""
     if agent.limits is None:
         return agent.task.thresholds if limits is None else limits
     if limits is not None and set(limits) != set(agent.limits):
@@ -97,7 +104,7 @@ def _limits_of(agent: Agent, run: int, limits: Sequence[float] | None) -> Sequen
 
 def _evaluate_job(agent: Agent, run: int, limit: float, episodes: range) -> pd.DataFrame:
     seed, threads = agent.seeds[run], torch.get_num_threads()
-    torch.set_num_threads(1)  # small products: more threads are slower, and the workers are the cores
+    torch.set_num_threads(1)  # the products are small: more threads are slower
     try:
         played = rollout(agent, limit, [1000 * (seed + 1) + episode for episode in episodes], run)
     finally:
@@ -121,8 +128,8 @@ def _evaluate_job(agent: Agent, run: int, limit: float, episodes: range) -> pd.D
 
 @functools.lru_cache(maxsize=2)
 def _environments(task_name: str, count: int):
-    """Building a simulator takes longer than playing an episode of some tasks: each process keeps its own."""
+    """Returns the process's own simulators, which it keeps.
+
+    For some tasks, building a simulator takes longer than playing an episode.
+    """
     return [make_env(task_name) for _ in range(count)]
-
-
-# --- Scores ---

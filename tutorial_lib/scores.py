@@ -1,28 +1,33 @@
-"""Scores as DSRL normalises them, their intervals, and the file of raw results."""
+"""Computes DSRL's normalised scores and their confidence intervals, and writes the file of raw results."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from numpy.typing import ArrayLike
 from scipy import stats
 
 from tutorial_lib.files import written_whole
 from tutorial_lib.tasks import Task, get_task
 
 
-def normalised_return(returns, task: Task):
-    """(R - R_min) / (R_max - R_min) with DSRL's constants."""
+def normalised_return(returns: ArrayLike, task: Task) -> np.ndarray:
+    """Returns (R - R_min) / (R_max - R_min) with DSRL's constants, with the shape of `returns`."""
     return (np.asarray(returns) - task.min_return) / (task.max_return - task.min_return)
 
 
-def normalised_cost(costs, threshold):
-    """C / L, as DSRL: (C + 1) / (L + 1) where L = 0. At most one means that the limit was kept."""
+def normalised_cost(costs: ArrayLike, threshold: ArrayLike) -> np.ndarray:
+    """Returns C / L for costs C and limits L of episodes, whose shapes broadcast.
+
+    Where L = 0 it is (C + 1) / (L + 1), as in DSRL. A value of at most one means that the limit was kept.
+    """
     epsilon = np.where(np.asarray(threshold) == 0, 1.0, 0.0)
     return (np.asarray(costs) + epsilon) / (np.asarray(threshold) + epsilon)
 
 
 def with_scores(results: pd.DataFrame) -> pd.DataFrame:
-    """Raw results with two more columns, `reward_score` and `cost_score`."""
+    """Returns raw results with two more columns, `reward_score` and `cost_score`."""
     if results.empty:
         return results.assign(reward_score=0.0, cost_score=0.0)
     parts = []
@@ -34,8 +39,14 @@ def with_scores(results: pd.DataFrame) -> pd.DataFrame:
     return pd.concat(parts, ignore_index=True)
 
 
-def summarise(results: pd.DataFrame, by=("task", "algorithm", "profile", "threshold")) -> pd.DataFrame:
-    """Mean scores per group with 95% bootstrap intervals over its episodes, and the number of episodes."""
+def summarise(
+    results: pd.DataFrame, by: Sequence[str] = ("task", "algorithm", "profile", "threshold")
+) -> pd.DataFrame:
+    """Returns one row per group: its numbers of seeds and episodes, its mean scores, and their intervals.
+
+    `by` are the columns that define a group. The intervals are 95% bootstrap intervals over the group's
+    episodes.
+    """
     rows = []
     for key, part in with_scores(results).groupby(list(by), sort=False):
         row = dict(zip(by, key, strict=True)) | {"seeds": part["seed"].nunique(), "episodes": len(part)}
@@ -56,6 +67,6 @@ def _interval(values: np.ndarray) -> tuple[float, float]:
 
 
 def save_results(results: pd.DataFrame, path: Path) -> None:
-    """Write raw results as CSV, whole or not at all."""
+    """Writes raw results as a CSV file, as a whole or not at all. Raises OSError if it cannot be written."""
     with written_whole(path) as temporary:
         results.to_csv(temporary, index=False, float_format="%.6g")

@@ -1,7 +1,12 @@
-"""The training loop: sample, update, log, checkpoint, resume. It knows algorithms only by their interface."""
+"""The training loop. It samples, updates, logs, saves checkpoints and resumes.
 
+It uses only the interface that all algorithms share.
+"""
+
+import math
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -9,7 +14,7 @@ from tqdm.auto import tqdm
 
 from tutorial_lib.agents import Agent
 from tutorial_lib.checkpoints import CHECKPOINT, TrainingError, resume, save_checkpoint
-from tutorial_lib.data.dataset import Dataset
+from tutorial_lib.data.dataset import Batch, Dataset
 from tutorial_lib.matmul import products, warn_where_bfloat16_is_slow
 
 
@@ -23,13 +28,15 @@ def train(
     on_checkpoint: Callable[[Agent], object] | None = None,
     progress: bool = True,
 ) -> list[dict]:
-    """Train all runs of `agent` until it has made `updates` updates (default: its config's). Returns the log.
+    """Trains all runs of `agent` until it has made `updates` updates, and returns the log.
 
-    With a `run_dir`, scalars go to metrics.csv, and everything that is needed to continue goes to
-    checkpoint.safetensors, every `checkpoint_every` updates. Called again on the same folder, it continues
-    from there, bit for bit on the same machine. Each run draws from a generator of its own, seeded by its
-    seed, so its batches do not depend on which runs train beside it. Raises TrainingError when a loss is NaN
-    or infinite.
+    The default of `updates` is the agent's own option. The log has one row per run every `log_every` updates.
+    If `run_dir` is given, every `checkpoint_every` updates the log is written to metrics.csv there, and
+    everything that is needed to continue to checkpoint.safetensors; then `on_checkpoint` is called. A later
+    call with the same folder continues from the checkpoint, and on the same machine its numbers are equal to
+    the bit. Each run has its own generator, seeded with the run's seed, so its batches do not depend on the
+    runs that train beside it. Raises TrainingError if a logged number is NaN or infinite, or if the folder
+    holds another run.
     """
     updates = agent.config.updates if updates is None else updates
     generators = [torch.Generator().manual_seed(seed) for seed in agent.seeds]
@@ -38,77 +45,99 @@ def train(
     log = resume(agent, generators, run_dir) if resumes and run_dir else []
     if agent.config.precision == "bfloat16" and agent.device.type == "cpu":
         warn_where_bfloat16_is_slow()
+    record = _Record(agent, generators, log, run_dir, log_every, checkpoint_every, on_checkpoint)
     selected = _select(agent, dataset)
     with products():
         if not (resumes or agent.updates):
             agent.prepare(selected, progress)
-            if run_dir:  # a reconstruction model can take longer than all updates
-                save_checkpoint(agent, generators, log, run_dir)
-        tensors = {id(part): part.tensors(agent.device) for part in selected}
-        data = [tensors[id(part)] for part in selected]
-        bar = tqdm(
-            total=updates,
-            initial=agent.updates,
-            desc=agent.name,
-            unit="update",
-            disable=not progress,
-            mininterval=0.5,
-        )
-        started, first = time.perf_counter(), agent.updates
-        while agent.updates < updates:
-            scalars = agent.update(agent.draw_all(data, generators))
-            bar.update()
-            last = agent.updates == updates
-            logs = last or agent.updates % log_every == 0
-            saves = run_dir and (last or agent.updates % checkpoint_every == 0)
-            if logs or saves:  # what is not finite must not reach a checkpoint either
-                rows = _rows(agent, scalars, (agent.updates - first) / (time.perf_counter() - started))
-                _check_finite(rows)
-            if logs:
-                log += rows
-                bar.set_postfix(_summary(scalars))
-            if saves and run_dir:
-                save_checkpoint(agent, generators, log, run_dir)
-                if on_checkpoint:
-                    on_checkpoint(agent)
-    bar.close()
+            record.save()  # training the reconstruction model can take longer than all updates
+        data = _tensors(selected, agent.device)
+        bar = tqdm(total=updates, initial=agent.updates, unit="update", mininterval=0.5, disable=not progress)
+        with bar:  # closed also after an error, so that the message stands on a line of its own
+            bar.set_description(agent.name)
+            record.start_clock()
+            while agent.updates < updates:
+                scalars = agent.update(agent.draw_all(data, generators))
+                bar.update()
+                if record.after_update(scalars, last=agent.updates == updates):
+                    bar.set_postfix(_summary(scalars))
     agent.check(log)
     return log
 
 
+@dataclass
+class _Record:
+    """What is kept of a training: its log, and its checkpoints if it has a folder."""
+
+    agent: Agent
+    generators: list[torch.Generator]
+    log: list[dict]
+    run_dir: Path | None
+    log_every: int
+    checkpoint_every: int
+    on_checkpoint: Callable[[Agent], object] | None
+
+    def start_clock(self) -> None:
+        """The log's updates per second count from here."""
+        self.started, self.first_update = time.perf_counter(), self.agent.updates
+
+    def after_update(self, scalars: dict[str, torch.Tensor], last: bool) -> bool:
+        """Logs and saves if it is time to. Returns whether it logged."""
+        logs = last or self.agent.updates % self.log_every == 0
+        saves = self.run_dir is not None and (last or self.agent.updates % self.checkpoint_every == 0)
+        if logs or saves:  # a checkpoint must hold finite numbers only
+            made = self.agent.updates - self.first_update
+            rows = _rows(self.agent, scalars, made / (time.perf_counter() - self.started))
+        if logs:
+            self.log += rows
+        if saves:
+            self.save()
+            if self.on_checkpoint:
+                self.on_checkpoint(self.agent)
+        return logs
+
+    def save(self) -> None:
+        """Writes the checkpoint, if there is a folder for it."""
+        if self.run_dir:
+            save_checkpoint(self.agent, self.generators, self.log, self.run_dir)
+
+
 def _select(agent: Agent, dataset: Dataset) -> list[Dataset]:
-    """What each run learns from; runs with the same limit share it."""
+    """Returns the data that each run learns from. Runs with the same limit share one dataset."""
     limits = agent.limits or (float("inf"),) * len(agent.seeds)
     of_limit = {limit: agent.select(dataset, limit) for limit in dict.fromkeys(limits)}
     return [of_limit[limit] for limit in limits]
 
 
+def _tensors(selected: list[Dataset], device: torch.device) -> list[Batch]:
+    """Returns each run's data on the device. Runs that share a dataset share its tensors."""
+    tensors = {id(part): part.tensors(device) for part in selected}
+    return [tensors[id(part)] for part in selected]
+
+
 def _rows(agent: Agent, scalars: dict[str, torch.Tensor], speed: float) -> list[dict]:
-    """One row per run: which, when, how fast, and every scalar."""
-    values = {name: value.tolist() for name, value in scalars.items()}
-    return [
-        {"seed": seed, "update": agent.updates, "updates_per_second": round(speed, 2)}
-        | {name: value[run] for name, value in values.items()}
-        for run, seed in enumerate(agent.seeds)
-    ]
+    """Returns one row per run: its seed (and limit), the update, the updates per second, and every scalar.
 
-
-def _check_finite(rows: list[dict]) -> None:
-    for row in rows:
-        for name, value in row.items():
-            if value - value != 0:  # NaN and both infinities
+    Raises TrainingError if a scalar is NaN or infinite.
+    """
+    values, rows = {name: value.tolist() for name, value in scalars.items()}, []
+    for run, seed in enumerate(agent.seeds):
+        which = {"seed": seed} | ({"limit": agent.limits[run]} if agent.limits else {})
+        of_run = {name: value[run] for name, value in values.items()}
+        for name, value in of_run.items():
+            if not math.isfinite(value):
+                words = " and ".join(f"{key} {number:g}" for key, number in which.items())
                 raise TrainingError(
-                    f"{name} is {value} at update {row['update']} of seed {row['seed']}: "
-                    "the last checkpoint is kept; try a smaller learning rate, look for outliers in the data"
+                    f"{name} is {value} at update {agent.updates} of {words}: the last checkpoint is kept; "
+                    "try a smaller learning rate, or look for outliers in the data"
                 )
+        rows.append(which | {"update": agent.updates, "updates_per_second": round(speed, 2)} | of_run)
+    return rows
 
 
 def _summary(scalars: dict[str, torch.Tensor]) -> dict[str, str]:
-    """What the progress bar shows: the losses and the safe fraction, averaged over the runs."""
+    """Returns what the progress bar shows: the losses and the safe fraction, averaged over the runs."""
     shown = {
         name: value for name, value in scalars.items() if name.endswith("_loss") or name == "safe_fraction"
     }
     return {name.removesuffix("_loss"): f"{value.mean():.3g}" for name, value in shown.items()}
-
-
-# --- Files ---

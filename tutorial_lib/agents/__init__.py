@@ -1,6 +1,6 @@
 """The algorithms, by the names that the command line and the results files use.
 
-To add one: write its file, and its class here.
+To add an algorithm, write its file and add its class to `ALGORITHMS`.
 """
 
 from tutorial_lib.agents.agent import Agent
@@ -14,10 +14,11 @@ ALGORITHMS: dict[str, type[Agent]] = {
     agent.name: agent
     for agent in (IQL, CIQL, C2IQLWithoutCR, C2IQLWithoutCC, C2IQL, BCAll, BCSafe, CPQ, PushedCPQ)
 }
+"""The class of every algorithm, by its name."""
 
 
 def get_algorithm(name: str) -> type[Agent]:
-    """The class of the algorithm with this name or slug, or ValueError that lists those there are."""
+    """Returns the class of the algorithm with this name or slug. Raises ValueError for an unknown name."""
     name = {slug(known): known for known in ALGORITHMS}.get(name, name)
     if name not in ALGORITHMS:
         raise ValueError(f"unknown algorithm {name!r}: the algorithms are {', '.join(ALGORITHMS)}")
@@ -25,5 +26,5 @@ def get_algorithm(name: str) -> type[Agent]:
 
 
 def slug(name: str) -> str:
-    """The algorithm's name as the command line and folders write it, e.g. C2IQL-wo-CR for 'C2IQL w/o CR'."""
+    """Returns a name as the command line and folders write it, e.g. C2IQL-wo-CR for 'C2IQL w/o CR'."""
     return name.replace(" ", "-").replace("/", "")

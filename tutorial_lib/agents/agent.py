@@ -1,8 +1,8 @@
-"""The interface of an algorithm, and what every algorithm shares: one update, acting, saving.
+"""The interface of an algorithm, and the code that every algorithm shares.
 
 An algorithm is written for one run. `Agent` holds S runs, which may differ in their seed and in their limit,
-and computes the algorithm's `draw`, `losses` and `step` for all of them (see `seeds`). The code that is
-taught is the code that runs.
+and computes the algorithm's `draw`, `losses` and `step` for all of them (see `seeds`). The code that the
+course explains is the code that runs.
 """
 
 import dataclasses
@@ -28,25 +28,26 @@ class Agent(Runs):
     Args:
         task: the task whose data the runs learn from.
         config: the options, an instance of the class's own `Config`. `configure` makes one.
-        seeds: the seed of each run.
-        limits: the limit on the cost of an episode that each run is trained for: one number, or one per run.
-            Only for algorithms with `needs_limit`.
-        device: where the runs are computed.
+        seeds: the seed of each run, 0 or more.
+        limits: the limit that each run is trained for, in cost per episode: one number, or one per run.
+            Algorithms with `needs_limit` need it, and all others must not have it.
+        device: the device on which the runs are computed.
 
-    Raises ValueError where seeds, limits or config do not fit.
+    Raises ValueError if seeds, limits or config do not fit.
     """
 
     name: ClassVar[str]
+    """The name that the command line and the results files use."""
     Config: ClassVar[type[AnyConfig]] = AnyConfig
-    """The class of its options."""
+    """The class of the algorithm's options."""
     needs_limit: ClassVar[bool] = False
-    """Is a run trained for one limit? If not, it knows no limit, or is told one when it plays."""
+    """True if a run is trained for one limit. If False, it takes no limit, or is told one while it plays."""
     scalars: ClassVar[dict[str, str]] = {}
-    """What the log says at each of its updates, by name: every loss as NAME_loss, and what `losses` adds."""
+    """The meaning of each scalar in the log, by name: of NAME_loss, and of what `losses` adds."""
     in_table1: ClassVar[bool] = True
-    """Is it a row of Table 1? Ablations and building blocks are not."""
+    """True if the algorithm is a row of Table 1. Ablations and building blocks are not."""
     at_test: ClassVar[tuple[str, ...]] = ()
-    """Options that only `player` reads: agents that differ in nothing else are trained alike."""
+    """The options that only `player` reads. Agents that differ only in these are trained in the same way."""
 
     def __init__(
         self,
@@ -73,128 +74,145 @@ class Agent(Runs):
         self.build_runs()
         self.data_checksum: str | None = None  # of the dataset that the runs were trained on
 
-    # What an algorithm writes ------------------------------------------------------------------------
+    # What an algorithm defines ------------------------------------------------------------------------
 
     def build(self) -> dict[str, nn.Module | Tensor]:
-        """The networks of one run, and its variables, by name.
+        """Returns the networks and the variables of one run, by name.
 
-        A variable is a plain tensor that no optimiser changes: a multiplier, say, or a statistic of the
-        A variable is a plain tensor that no optimiser changes: a multiplier, say, or a statistic of the
-        dataset. It is saved with the networks. `measure` may set it before the first update, `step` after
-        every update.
+        A variable is a tensor that no optimiser changes, for example a multiplier or a statistic of the
+        dataset. It is saved with the networks. `measure` may set it before the first update, and `step` after
+        every update. The variables here are `observation_mean` and `observation_std`, both (obs,).
         """
         zeros = torch.zeros(self.task.obs_dim)
         return {"observation_mean": zeros, "observation_std": torch.ones_like(zeros)}
 
     def select(self, dataset: Dataset, limit: float) -> Dataset:
-        """The data that a run with this limit learns from, (a part of) the dataset; the run sees no other.
+        """Returns the data that a run with this limit learns from. The run sees no other data.
 
-        Actions are kept a hair inside their bounds, as in IQL's code: a Gaussian policy with a tanh mean
-        cannot reach an action of exactly one.
+        Actions are clamped to [-1 + 1e-5, 1 - 1e-5], as in IQL's code, because a Gaussian policy with a tanh
+        mean cannot reach an action of exactly one.
         """
         return dataclasses.replace(dataset, actions=np.clip(dataset.actions, -1 + 1e-5, 1 - 1e-5))
 
     def measure(self, dataset: Dataset) -> dict[str, Tensor]:
-        """Variables of one run that depend on the data it learns from, by name."""
+        """Returns the variables of one run that depend on the data that it learns from, by name."""
         if not self.config.normalise_observations:
             return {}
         mean, std = dataset.observations.mean(0), dataset.observations.std(0)
         return {"observation_mean": torch.tensor(mean), "observation_std": torch.tensor(std) + 1e-3}
 
     def prepare(self, datasets: Sequence[Dataset], progress: bool = True) -> None:
-        """What must be learned before the first update, from the selected dataset of each run."""
+        """Does what must be done before the first update: it measures each run's variables.
+
+        `datasets` has the selected dataset of each run. `progress` shows a progress bar where this takes
+        long.
+        """
         measured = {id(dataset): self.measure(dataset) for dataset in datasets}
         for run, dataset in enumerate(datasets):
             for name, value in measured[id(dataset)].items():
                 self.variables[name][run] = value.to(self.device)
 
     def draw(self, data: Batch, generator: torch.Generator, limit: float) -> dict[str, Tensor]:
-        """Everything random that one run's update sees, by name: by default a batch of transitions and its
-        limit.
+        """Returns everything random that one update of one run sees, by name.
 
-        `data` are all transitions that the run learns from, on the agent's device. All draws come from
-        `generator`, which is on the CPU, so that they are the same on every device. Each value has the same
-        shape in every run.
+        By default this is a batch of transitions (B, ...) and `limit`, the run's limit, (B,). `data` are all
+        transitions that the run learns from, on the agent's device. All random numbers come from `generator`,
+        which is on the CPU, so that they are the same on every device. Each value has the same shape in every
+        run.
         """
         batch = sample_batch(data, self.config.batch_size, generator)._asdict()
         return batch | {"limit": torch.full((self.config.batch_size,), limit)}
 
     def losses(self, net: Networks, batch: Fields) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-        """One run's losses and other scalars to be logged, by name, on what `draw` returned.
+        """Returns one run's losses, and other scalars for the log, both by name.
 
-        Every loss must reach only the network that it trains.
+        The gradient of a loss must reach only the networks that it trains. `batch` holds what `draw`
+        returned.
         """
         raise NotImplementedError
 
     def step(self, net: Networks, batch: Fields, scalars: dict[str, Tensor]) -> dict[str, Tensor]:
-        """New values of variables of one run, by name, after an update of its networks."""
+        """Returns new values of one run's variables, by name, after each update of its networks."""
         return {}
 
     def optimiser(self, name: str) -> Rates:
-        """How Adam changes the network called `name`."""
+        """Returns how Adam trains the network called `name`."""
         raise NotImplementedError
 
     def tau(self, name: str) -> float:
-        """The Polyak step of the target network of the network called `name`."""
+        """Returns the Polyak step of the target network of the network called `name`."""
         raise NotImplementedError
 
     def network_input(self, net: Networks, observations: Tensor, limit: Tensor) -> Tensor:
-        """What the networks see of observations (..., obs) and limits (...): the normalised observations."""
+        """Returns the networks' input for observations (..., obs) and limits (...). It is (..., inputs).
+
+        By default this is the normalised observations."""
         return (observations - net.observation_mean) / net.observation_std
 
     def player(self, limits: Sequence[float] | np.ndarray, seeds: Sequence[int], run: int = 0) -> Player:
-        """Plays E episodes of one run at once, under limits (E,); its chances come from seeds (E,)."""
+        """Returns a player of one run for E episodes, each with its own limit and seed, (E,).
+
+        A player that draws random numbers takes them from these seeds.
+        """
         return Player(self, limits, run)
 
     def predicted_cost(self, observations: np.ndarray, limits: np.ndarray, run: int = 0) -> np.ndarray:
-        """The cost of an episode that the run expects of its action now, (E,); NaN: it cannot tell."""
+        """Returns the cost of an episode that the run predicts for its action at observations (E, obs), (E,).
+
+        It is NaN if the algorithm predicts no cost. The limits are (E,).
+        """
         return np.full(len(observations), np.nan)
 
     def diagnose(self, dataset: Dataset) -> dict[str, float]:
-        """Numbers that describe the trained agent on its dataset, by name, for studies that ask for them."""
+        """Returns numbers that describe the trained agent on its dataset, by name. Studies ask for them."""
         return {}
 
     def check(self, log: list[dict[str, Any]]) -> None:
-        """Warns of what went wrong in a finished training, whose log this is."""
+        """Warns if the log of a finished training shows a problem."""
 
-    # What they all share -----------------------------------------------------------------------------
+    # What all algorithms share -----------------------------------------------------------------------------
 
     @classmethod
     def configure(cls, profile: str = "small", task: Task | None = None, **changes: Any) -> AnyConfig:
-        """The options of a profile, with the task's own where one is given, and with `changes` made last.
+        """Returns the options of a profile, changed by those of the task, if one is given, and by `changes`.
 
-        Raises ValueError for an unknown profile, an option that the algorithm does not read, or a value out
-        of its bounds.
+        Raises ValueError for an unknown profile, an option that the algorithm does not have, or a value that
+        is out of its bound.
         """
         return cls.Config.make(profile, None if task is None else task.name).changed(**changes)
 
     def draw_all(self, data: Sequence[Batch], generators: Sequence[torch.Generator]) -> dict[str, Tensor]:
-        """What `draw` returns for each run, from its own data and generator, stacked: (S, ...)."""
+        """Returns what `draw` returns for each run, from its own data and generator, stacked: (S, ...)."""
         limits = self.limits or (float("inf"),) * len(self.seeds)
         runs = [self.draw(*run) for run in zip(data, generators, limits, strict=True)]
         stack = {name: torch.stack([run[name] for run in runs]) for name in runs[0]}
         return lift.map_tensors(stack, lambda x: x.to(self.device, non_blocking=True))
 
     def act(self, observations: np.ndarray, limits: np.ndarray, run: int = 0) -> np.ndarray:
-        """Mean actions (E, act) of one run at observations (E, obs) under limits (E,), by network
-        `policy`."""
+        """Returns the mean actions (E, act) of one run's network `policy`.
+
+        The observations are (E, obs) and the limits are (E,).
+        """
         with torch.no_grad():
             net, x = self.networks(run), (self._tensor(observations), self._tensor(limits))
             mean, _ = net.policy(self.network_input(net, *x))
             return mean.cpu().numpy()
 
     def playing_with(self, **changes: Any) -> Self:
-        """The same trained agent with other values of options that only its player reads (`at_test`)."""
+        """Returns the same trained agent with other values of options that only its player reads (`at_test`).
+
+        Raises ValueError for an option that training reads.
+        """
         if unread := set(changes) - set(self.at_test):
             raise ValueError(
-                f"{self.name}: {', '.join(sorted(unread))}: training reads this, not only playing"
+                f"{self.name}: {', '.join(sorted(unread))} cannot change: training reads it, too"
             )
         other = type(self).__new__(type(self))
         vars(other).update(vars(self) | {"config": self.config.changed(**changes)})
         return other
 
     def _check_limits(self, limits: float | Sequence[float] | None) -> tuple[float, ...] | None:
-        """One limit per run, or None for algorithms that are trained for none."""
+        """Returns one limit per run, or None for algorithms that are trained for no limit."""
         if self.needs_limit != (limits is not None):
             verb = "is trained for one limit: give it one" if self.needs_limit else "takes no limit to train"
             raise ValueError(f"{self.name} {verb}")

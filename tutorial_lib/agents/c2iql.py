@@ -1,16 +1,32 @@
 """C2IQL: CIQL with reconstructed costs, and with the limit as an input of every network.
 
-Sources: Algorithms 1 and 2 of the C2IQL paper. The numbers of Algorithm 2's lines stand beside the code.
+Sources: Algorithms 1 and 2 of the C2IQL paper. The numbers of Algorithm 2's lines stand beside the code. The
+two ablations of Section 4.2 are the classes after `C2IQL`, and each changes one switch.
 
-Departures: those of CIQL, and what the paper leaves open: one limit per transition or per batch
-Departures: those of CIQL, and what the paper leaves open: one limit per transition or per batch
-(`thresholds_per`), how an infinite limit is told (`infinite_at_test`), a threshold of zero
-(`zero_threshold`), and what a time limit means to the cost critics (`time_limits`). Every such option says
-what the paper says and what it does not.
+Departures:
 
-Measured: the figures and tables of the page "Results", from `data/results/table1.csv` and `ablations.csv`.
+1. The departures of CIQL.
+2. A limit is drawn for every transition (`thresholds_per`), which has a lower variance than one per batch.
+3. In profile `small`, the threshold set also contains zero (`zero_threshold`).
+4. The policy is told an infinite limit as soon as nothing can break the limit any more (`infinite_at_test`),
+   and an infinite limit enters the networks as 1.5 cost ranges.
+5. In profile `small`, the reconstruction model is trained with more noise (`crm_noise_rate`), because the
+   paper's noise is smaller than the critics' error.
 
-The two ablations of Section 4.2 are the classes below C2IQL, each one switch away.
+The paper leaves points 2 to 4 open. The text of each option says what is known of it.
+
+Measured: the page "Results" has the tables and figures, from `data/results/table1.csv` and `ablations.csv`.
+In profile `small`, some tasks have other options, for these reasons:
+
+- DroneRun: with `time_limits='rate'`, agents stayed near the many episodes that never exceed the speed limit.
+  Their normalised reward was 0.61 under a limit of 110. With `time_limits='mask'` it is 0.70.
+- AntRun and AntCircle: a single action of an ant's gait changes the cost very little. With `unsafe_price=6`,
+  the cost was 43 under AntRun's limit of 30, and 98 under AntCircle's limit of 40. On AntCircle the heads of
+  the critics differ mostly by their error. With the higher price and a reconstruction model that is trained
+  for this error (`crm_noise_rate`), the cost became 55 (five seeds).
+- DroneCircle: the higher of two cost critics predicts costs of 52, 59 and 69 under the three limits, and the
+  costs are 5, 9 and 11 (study `ablations`). A single cost critic predicts 20, 29 and 34, the costs are 22, 32
+  and 36, and the normalised reward is higher by 0.05.
 """
 
 from collections.abc import Sequence
@@ -24,6 +40,7 @@ from torch import Tensor
 from tutorial_lib import losses
 from tutorial_lib.agents.implicit import ConstrainedAgent, ConstrainedConfig
 from tutorial_lib.agents.player import Player
+from tutorial_lib.agents.seeds import Fields, Networks
 from tutorial_lib.costs.conditioning import ConditioningConfig, draw_thresholds, encode, told_limit
 from tutorial_lib.costs.discounting import average_threshold
 from tutorial_lib.costs.reconstruction import (
@@ -32,27 +49,20 @@ from tutorial_lib.costs.reconstruction import (
     reconstruction_error,
     train_reconstruction,
 )
-from tutorial_lib.data.dataset import Dataset
+from tutorial_lib.data.dataset import Batch, Dataset
 from tutorial_lib.networks import gaussian_log_prob
+from tutorial_lib.tasks import Task
 
 
 @dataclass(frozen=True)
 class C2IQLConfig(ConstrainedConfig, ReconstructionConfig, ConditioningConfig):
-    """The options of C2IQL: CIQL's, the reconstruction model's, and those of constraint conditioning."""
+    """The options of C2IQL: those of CIQL, of the reconstruction model and of constraint conditioning."""
 
+    # "Measured", at the top of this file, has the reasons.
     tasks = {
-        # DroneRun's agents stayed near the many episodes that never exceed the speed limit, at a normalised
-        # reward of 0.61 under a limit of 110; with masked time limits they have 0.70.
         "DroneRun": {"time_limits": "mask"},
-        # One action of an ant's gait hardly shows in its cost: at a price of 6 an agent paid 43 under
-        # AntRun's limit of 30, and 98 under AntCircle's of 40. On AntCircle the critics' heads differ mostly
-        # by error, and a reconstruction model that is trained for that (with the price, five seeds) made that
-        # 55.
         "AntRun": {"unsafe_price": 20.0},
         "AntCircle": {"unsafe_price": 200.0, "crm_noise_rate": 0.05},
-        # The highest of two cost critics expects 52, 59 and 69 under the three limits, and 5, 9 and 11 are
-        # paid (study ablations); one alone expects 20, 29 and 34, and 22, 32 and 36 are paid, for 0.05 more
-        # of reward.
         "DroneCircle": {"cost_critics": 1},
     }
 
@@ -68,21 +78,23 @@ class WithoutCCConfig(ConstrainedConfig, ReconstructionConfig):
 
 
 class BudgetPlayer(Player):
-    """Tells the policy, at every step, what is left of the limit (eq. 23)."""
+    """A player that tells the policy at every step what is left of the limit (eq. 23)."""
 
     agent: "C2IQL"
 
-    def __init__(self, agent: "C2IQL", limits: np.ndarray, run: int = 0):
+    def __init__(self, agent: "C2IQL", limits: Sequence[float] | np.ndarray, run: int = 0):
         super().__init__(agent, limits, run)
         self.spent, self.t = np.zeros(len(self.limits)), 0
 
     @property
     def told(self) -> np.ndarray:
+        """The limit that the policy is told at this step, (E,)."""
         config = self.agent.config
-        remaining = config.time_limits == "mask"  # then its critics speak of the remaining cost
+        remaining = config.time_limits == "mask"  # the critics then predict the remaining cost
         return told_limit(self.agent.task, config, self.limits, self.spent, self.t, remaining)
 
     def see(self, rewards: np.ndarray, costs: np.ndarray) -> None:
+        """Counts the costs (E,) of the step."""
         self.spent, self.t = self.spent + costs, self.t + 1
 
     def predicted_cost(self, observations: np.ndarray) -> np.ndarray:
@@ -90,19 +102,21 @@ class BudgetPlayer(Player):
 
 
 class C2IQL(ConstrainedAgent):
-    """Algorithm 2. The numbers of its lines stand beside the code that does them."""
+    """C2IQL, Algorithm 2. The numbers of its lines stand beside the code."""
 
     name = "C2IQL"
     Config: ClassVar[type[ConstrainedConfig]] = C2IQLConfig
-    config: Any  # C2IQLConfig, without what the ablations have not
+    config: Any  # a C2IQLConfig; the ablations lack some of its options
     scalars = ConstrainedAgent.scalars | {
         "cost_mean": "mean expected cost of an episode, in unsafe steps: what line 9 compares with the limit",
     }
     at_test: ClassVar[tuple[str, ...]] = ("infinite_at_test",)
     conditioned = True
+    """True if the limit is an input of every network."""
     reconstructs = True
+    """True if the cost of an episode is reconstructed from m heads."""
 
-    def __init__(self, task, config, *args, **kwargs):
+    def __init__(self, task: Task, config: Any, *args: Any, **kwargs: Any):
         super().__init__(task, config, *args, **kwargs)
         self.gammas = torch.tensor(self.cost_gammas, device=self.device)  # (m,)
         if self.reconstructs:  # untrained until `prepare` or `load_state`
@@ -118,14 +132,15 @@ class C2IQL(ConstrainedAgent):
         return int(self.conditioned)
 
     def prepare(self, datasets: Sequence[Dataset], progress: bool = True) -> None:
-        if self.reconstructs:  # one model, which all runs share: they learn from the same episodes
+        """Trains the reconstruction model, then does what CIQL does before the first update."""
+        if self.reconstructs:  # all runs share one model, because they learn from the same episodes
             self.reconstruction = train_reconstruction(
                 self.task, self.config, datasets[0], device=self.device, progress=progress
             )
         super().prepare(datasets, progress)
 
-    def draw(self, data, generator, limit):
-        """Line 5: thresholds for the batch."""
+    def draw(self, data: Batch, generator: torch.Generator, limit: float) -> dict[str, Tensor]:
+        """Returns a batch of transitions, and thresholds (B,) as its `limit` (lines 4 and 5)."""
         batch = super().draw(data, generator, limit)
         return (
             batch | {"limit": draw_thresholds(self.task, self.config, generator)}
@@ -133,34 +148,38 @@ class C2IQL(ConstrainedAgent):
             else batch
         )
 
-    def network_input(self, net, observations, limit):
+    def network_input(self, net: Networks, observations: Tensor, limit: Tensor) -> Tensor:
+        """Returns normalised observations with the encoded limit as one more input, (..., obs + 1)."""
         observations = super().network_input(net, observations, limit)
         if not self.conditioned:
             return observations
         return torch.cat([observations, encode(limit, self.task).unsqueeze(-1)], -1)
 
     def episode_cost(self, q_cost: Tensor) -> Tensor:
-        """Lines 6 to 8: discounted costs (..., m) as the cost of a whole episode, (...,)."""
+        """Returns the cost of a whole episode, (...,), for discounted costs (..., m) (lines 6 to 8).
+
+        It is in unsafe steps per episode.
+        """
         horizon, gammas = self.task.horizon, self.gammas
-        if self.config.time_limits == "rate":  # bootstrapped for ever: keep the first T steps' share
+        if self.config.time_limits == "rate":  # the sum has no end: keep the share of the first T steps
             q_cost = q_cost * (1 - gammas**horizon)
         if self.reconstructs:
             return self.reconstruction(q_cost)
-        return q_cost.squeeze(-1) / average_threshold(1.0, self.config.gamma, horizon)  # L~ / L, eq. 2
+        return q_cost.squeeze(-1) / average_threshold(1.0, self.config.gamma, horizon)  # L~ / L (eq. 2)
 
-    def losses(self, net, batch):
+    def losses(self, net: Networks, batch: Fields) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
         config, a, limit = self.config, batch.actions, batch.limit
         s = self.network_input(net, batch.observations, limit)
-        s_next = self.network_input(
-            net, batch.next_observations, limit
-        )  # the same limit: it stands for a rate
+        # s' has the same limit as s, because a limit stands for a cost rate.
+        s_next = self.network_input(net, batch.next_observations, limit)
 
-        # Lines 6-8: cost reconstruction. Of the ensemble, the critic that expects the most cost counts.
+        # Lines 6-8: cost reconstruction. The critic that predicts the highest cost counts.
         q_cost = net.target_cost_critics(s, a)  # (k, B, m)
         cost, worst = self.episode_cost(q_cost).max(0)  # (B,)
         q_cost = q_cost.take_along_dim(worst[None, :, None], 0).squeeze(0)  # (B, m)
 
-        # Line 18: its target, here already: what the recorded step expects. (Eq. 16 prints V_c(s), not s'.)
+        # Line 18: its target, which is needed here, too: it is the cost of the recorded step.
+        # Eq. 16 prints V_c(s), but V_c(s') is meant.
         mask = self.cost_mask(batch)[:, None]
         cost_target = losses.td_target(batch.costs[:, None], self.gammas, net.cost_value(s_next), mask)
         if config.recorded_step:
@@ -175,7 +194,7 @@ class C2IQL(ConstrainedAgent):
         v = net.value(s)
         value_loss = losses.expectile_loss(q, v, config.kappa_1)
 
-        # Lines 13-14: cost value function, under the implicit policy of the line above.
+        # Lines 13-14: cost value function of the implicit policy that V_r above defines.
         weight = losses.expectile_weight(q - v, config.evaluated_kappa)
         cost_value_loss = losses.cost_value_loss(weight, q_cost, v_cost)
 
@@ -183,7 +202,7 @@ class C2IQL(ConstrainedAgent):
         target = losses.td_target(batch.rewards, config.gamma, net.value(s_next), self.reward_mask(batch))
         critic_loss = losses.td_loss(target, net.critics(s, a))
 
-        # Lines 17-18: cost Q-value function, every gamma_i at once.
+        # Lines 17-18: cost Q-value function, for all gamma_i at once.
         cost_critic_loss = losses.td_loss(cost_target, net.cost_critics(s, a))
 
         # Lines 19-20: policy extraction.
@@ -203,23 +222,28 @@ class C2IQL(ConstrainedAgent):
             "negative_q": (q_reward < 0).float().mean(),
         }
 
-    def player(self, limits, seeds, run=0):
+    def player(self, limits: Sequence[float] | np.ndarray, seeds: Sequence[int], run: int = 0) -> Player:
         return BudgetPlayer(self, limits, run) if self.conditioned else super().player(limits, seeds, run)
 
-    def predicted_cost(self, observations, limits, run=0):
+    def predicted_cost(self, observations: np.ndarray, limits: np.ndarray, run: int = 0) -> np.ndarray:
+        """Returns the cost of an episode, (E,), that the highest cost critic predicts for the mean action.
+
+        It is in unsafe steps per episode. The observations are (E, obs) and the limits are (E,).
+        """
         with torch.no_grad():
             net = self.networks(run)
             s = self.network_input(net, self._tensor(observations), self._tensor(limits))
             action, _ = net.policy(s)
             return self.episode_cost(net.cost_critics(s, action)).amax(0).cpu().numpy()
 
-    def diagnose(self, dataset):
+    def diagnose(self, dataset: Dataset) -> dict[str, float]:
+        """Returns the error of the reconstruction model, in unsafe steps per episode."""
         if not self.reconstructs:
             return {}
         error = reconstruction_error(self.reconstruction, self.task, self.config, dataset)
         return {"reconstruction_error": error}
 
-    def state(self):
+    def state(self) -> dict[str, Tensor]:
         if not self.reconstructs:
             return super().state()
         model = {f"reconstruction.{key}": value for key, value in self.reconstruction.state_dict().items()}
@@ -227,7 +251,7 @@ class C2IQL(ConstrainedAgent):
 
 
 class C2IQLWithoutCR(C2IQL):
-    """Without cost reconstruction (Section 4.2): one discount factor, and L~ as the limit."""
+    """C2IQL without cost reconstruction (Section 4.2). It has one discount factor, and L~ is the limit."""
 
     name = "C2IQL w/o CR"
     in_table1 = False
@@ -236,7 +260,7 @@ class C2IQLWithoutCR(C2IQL):
 
 
 class C2IQLWithoutCC(C2IQL):
-    """Without constraint conditioning (Section 4.2): trained for one limit, which no network sees."""
+    """C2IQL without constraint conditioning (Section 4.2). It is trained for one limit, which is no input."""
 
     name = "C2IQL w/o CC"
     in_table1 = False

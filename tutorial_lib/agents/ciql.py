@@ -1,41 +1,55 @@
-"""Constrained implicit Q-learning (CIQL): IQL with a penalty, and costs under the same implicit policy.
+"""Constrained implicit Q-learning (CIQL): IQL with a penalty on cost, and cost critics of its policy.
 
 Sources: Section 3.1 of the C2IQL paper, equations 11 to 18.
 
-Departures: those of IQL, and the options of `ConstrainedConfig` where profile `small` changes them: a price
-    in the
-place of eq. 11's zero (`unsafe_price`), and the recorded step (`recorded_step`). Profile `paper` has neither.
+Departures:
+
+1. The departures of IQL.
+2. In profile `small`, the value of an unsafe action is Q_r minus a price of its cost beyond the limit. In eq.
+   11 and in profile `paper` it is zero (`unsafe_price`).
+3. In profile `small`, the cost of a recorded action is at least that of its recorded step (`recorded_step`).
+4. The cost critics bootstrap through time limits, and their values are multiplied by 1 - gamma^T
+   (`time_limits`). The paper does not say what a time limit means.
+5. There are two cost critics, and the higher cost counts (`cost_critics`). The paper does not say how many it
+   has.
+
+The consequences of departures 2, 4 and 5 were measured on C2IQL, and the file `c2iql.py` has the numbers.
 """
 
 import torch
+from torch import Tensor
 
 from tutorial_lib import losses
 from tutorial_lib.agents.implicit import ConstrainedAgent, ConstrainedConfig
+from tutorial_lib.agents.seeds import Fields, Networks
 from tutorial_lib.costs.discounting import average_threshold
 from tutorial_lib.networks import gaussian_log_prob
 
 
 class CIQL(ConstrainedAgent):
-    """Equations 11 to 18 for one limit L: costs are discounted once and compared with L~ (eq. 2)."""
+    """CIQL, equations 11 to 18, for one limit L. The discounted cost is compared with L~ (eq. 2)."""
 
     name = "CIQL"
     Config = ConstrainedConfig
     needs_limit = True
     in_table1 = False
 
-    def episode_cost(self, q_cost):
-        """Discounted costs (..., 1) over L~ / L (eq. 2), (...,): comparing them with L is Q_c against L~."""
+    def episode_cost(self, q_cost: Tensor) -> Tensor:
+        """Returns discounted costs (..., 1) divided by L~ / L (eq. 2), (...,), in unsafe steps per episode.
+
+        To compare them with L is to compare Q_c with L~.
+        """
         gamma, horizon = self.config.gamma, self.task.horizon
-        if self.config.time_limits == "rate":  # bootstrapped for ever: keep the first T steps' share
+        if self.config.time_limits == "rate":  # the sum has no end: keep the share of the first T steps
             q_cost = q_cost * (1 - gamma**horizon)
         return q_cost.squeeze(-1) / average_threshold(1.0, gamma, horizon)
 
-    def losses(self, net, batch):
+    def losses(self, net: Networks, batch: Fields) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
         config, a, limit = self.config, batch.actions, batch.limit
         s = self.network_input(net, batch.observations, limit)
         s_next = self.network_input(net, batch.next_observations, limit)
 
-        # What an action costs: the highest of the cost critics, and no less than the recorded step (eq. 16).
+        # The cost of an action: the highest of the cost critics, and at least the recorded step (eq. 16).
         q_cost = net.target_cost_critics(s, a).amax(0)  # (B, 1)
         cost = self.episode_cost(q_cost)
         mask = self.cost_mask(batch)[:, None]
@@ -52,7 +66,7 @@ class CIQL(ConstrainedAgent):
         v = net.value(s)
         value_loss = losses.expectile_loss(q, v, config.kappa_1)
 
-        # Eq. 17: cost value function, under the implicit policy of the line above (Theorem 1).
+        # Eq. 17: cost value function of the implicit policy that V_r above defines (Theorem 1).
         weight = losses.expectile_weight(q - v, config.evaluated_kappa)
         cost_value_loss = losses.cost_value_loss(weight, q_cost, v_cost)
 

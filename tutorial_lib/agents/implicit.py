@@ -1,10 +1,10 @@
-"""What IQL, CIQL and C2IQL share: options, networks, and how a constraint enters the reward value."""
+"""The options, the networks and the penalisation that IQL, CIQL and C2IQL share."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal
 
-from torch import Tensor
+from torch import Tensor, nn
 
 from tutorial_lib import losses
 from tutorial_lib.agents.critic import CriticAgent, CriticConfig, cost_guess, goes_on, reward_guess
@@ -16,39 +16,41 @@ from tutorial_lib.networks import Critics, Policy, Value
 
 @dataclass(frozen=True)
 class ImplicitConfig(CriticConfig):
-    """The options of IQL, which CIQL and C2IQL have, too."""
+    """The options that IQL, CIQL and C2IQL have."""
 
     kappa_1: Annotated[float, SHARE] = 0.7
-    """Expectile of the value functions V_r and V_c (Table 4)."""
+    """The expectile of the value functions V_r and V_c (Table 4)."""
     value_lr: Annotated[float, NOT_NEGATIVE] = 1e-3
     """Adam's learning rate for V_r and V_c (Table 4)."""
 
-    profiles = {"small": {"kappa_1": 0.8}}  # sharper than the paper's 0.7
+    profiles = {"small": {"kappa_1": 0.8}}  # higher than the paper's 0.7
 
 
 @dataclass(frozen=True)
 class ConstrainedConfig(ImplicitConfig):
-    """The options of CIQL, which C2IQL has, too."""
+    """The options that CIQL and C2IQL have."""
 
     kappa_2: Annotated[float, SHARE] = 0.9
-    """Expectile of the policy extraction (Table 4): the temperature between cloning and maximising."""
+    """The expectile of the policy extraction (Table 4), a temperature between cloning and maximising."""
     time_limits: Literal["rate", "bootstrap", "mask"] = "rate"
-    """What a time limit means to the cost critics; the paper does not say. 'rate' bootstraps through it and
-    scales head i by 1 - gamma_i^T before the cost is compared; 'bootstrap' leaves out the factor; 'mask'
-    stops there, so that the estimate is the remaining cost, which is compared with the unscaled remaining
-    budget."""
+    """What a time limit means to the cost critics. The paper does not say. With 'rate', their targets
+    bootstrap through it, and head i is multiplied by 1 - gamma_i^T before the cost is compared with the
+    limit. With 'bootstrap', there is no such factor. With 'mask', nothing follows a time limit. The critics
+    then predict the remaining cost, which is compared with the remaining budget without rescaling."""
     cost_kappa: Annotated[float | None, SHARE] = None
-    """Expectile whose implicit policy the cost critics evaluate. None: kappa_1, as in Algorithm 2. The policy
-    that runs is extracted with kappa_2, so kappa_2 here evaluates (nearly) the policy that runs."""
+    """The expectile of the implicit policy whose cost the cost critics learn. None means kappa_1, as in
+    Algorithm 2. The policy that acts is extracted with kappa_2, so with the value of kappa_2 here the cost
+    critics learn (nearly) the cost of the policy that acts."""
     cost_critics: Annotated[int, COUNT] = 2
-    """Number of cost critics; the highest cost counts. The paper does not say; 1: a single critic."""
+    """The number of cost critics, of which the highest cost counts. The paper does not give it."""
     unsafe_price: Annotated[float | None, NOT_NEGATIVE] = None
-    """What an unsafe action is worth. None: zero, as in eq. 11. A number: Q_r minus a price per unit of cost
-    beyond the limit; the price is this number times the dataset's mean Q_r per cost range."""
+    """The price of cost beyond the limit, in units of `reward_scale` (discounted reward) per cost range. None
+    means that an unsafe action has the value zero, as in eq. 11. With a number, its value is Q_r minus the
+    price of every unit of cost beyond the limit, which is unsafe_price * reward_scale / cost_range."""
     recorded_step: bool = False
-    """Does an action cost no less than its recorded step, c + gamma V_c(s')? The critics are smooth; the step
-    is exact about where cost sets in (a speed, a wall), and of two noisy estimates the higher one leaves a
-    margin."""
+    """If true, the cost of a recorded action is at least that of its recorded step, c + gamma V_c(s'). The
+    critics are smooth, and the recorded step is exact where cost begins (at a speed or at a wall). Of two
+    noisy estimates, the higher one also leaves a margin."""
 
     profiles = {"small": {"kappa_2": 0.97, "unsafe_price": 6.0, "recorded_step": True}}
 
@@ -59,7 +61,7 @@ class ConstrainedConfig(ImplicitConfig):
 
 
 class ImplicitAgent(CriticAgent):
-    """IQL, CIQL and C2IQL: value functions and critics, and a policy that is extracted from them."""
+    """What IQL, CIQL and C2IQL share: value functions, critics, and a policy that is extracted from them."""
 
     config: ImplicitConfig
     targets: ClassVar[tuple[str, ...]] = ("critics",)
@@ -71,7 +73,11 @@ class ImplicitAgent(CriticAgent):
 
 
 class ConstrainedAgent(ImplicitAgent):
-    """CIQL and C2IQL: the cost of the implicit policy, and a reward value that a limit on it penalises."""
+    """What CIQL and C2IQL share: cost critics of the implicit policy, and a penalised reward value.
+
+    Costs are in unsafe steps, discounted in the heads of Q_c and V_c, and of a whole episode in
+    `episode_cost`.
+    """
 
     config: ConstrainedConfig
     targets = ("critics", "cost_critics")
@@ -88,7 +94,7 @@ class ConstrainedAgent(ImplicitAgent):
 
     @property
     def extra_inputs(self) -> int:
-        """Inputs of every network besides the observation."""
+        """The number of inputs of every network besides the observation."""
         return 0
 
     @property
@@ -96,7 +102,7 @@ class ConstrainedAgent(ImplicitAgent):
         """The discount factors of the m cost heads."""
         return (self.config.gamma,)
 
-    def build(self):
+    def build(self) -> dict[str, nn.Module | Tensor]:
         task, config = self.task, self.config
         inputs = task.obs_dim + self.extra_inputs
         scale, cost_scale = reward_guess(task, config), cost_guess(task, self.cost_gammas)
@@ -109,10 +115,10 @@ class ConstrainedAgent(ImplicitAgent):
         }
 
     def prepare(self, datasets: Sequence[Dataset], progress: bool = True) -> None:
-        """Besides, all cost heads start at the dataset's own cost rate.
+        """Measures each run's variables, and lets all cost heads start at the dataset's cost rate.
 
-        The closer the first guess, the less the heads disagree while they converge, and a reconstruction
-        looks at their differences.
+        With a closer first guess the heads disagree less while they converge, and a reconstruction depends on
+        their differences.
         """
         super().prepare(datasets, progress)
         horizon, limit = self.task.horizon, self.task.typical_limit
@@ -120,18 +126,24 @@ class ConstrainedAgent(ImplicitAgent):
         self.fill_last_bias(("cost_value", "cost_critics"), guesses)
 
     def episode_cost(self, q_cost: Tensor) -> Tensor:
-        """Discounted costs (..., m) as the cost of a whole episode, (...,), to be compared with a limit."""
+        """Returns the cost of a whole episode, (...,), for discounted costs (..., m).
+
+        It is in unsafe steps per episode, like the limit with which it is compared.
+        """
         raise NotImplementedError
 
     def cost_mask(self, batch: Fields) -> Tensor:
-        """1 where Q_c bootstraps, 0 where nothing follows, (B,)."""
+        """Returns 1 where Q_c bootstraps and 0 where nothing follows, (B,)."""
         return goes_on(batch, self.config.time_limits)
 
     def penalised_q(
         self, net: Networks, q_reward: Tensor, cost: Tensor, value_cost: Tensor, limit: Tensor
     ) -> Tensor:
-        """Eq. 11, or the course's variant with a price: Q_r, episode cost and limit (B,), V_c's heads (B,
-        m)."""
+        """Returns the penalised Q_r, (B,), by eq. 11, or by `losses.priced_q` if there is an `unsafe_price`.
+
+        `q_reward` is in discounted reward. `cost` and `limit` are in unsafe steps per episode. All three are
+        (B,). `value_cost` has the heads of V_c, (B, m), in discounted cost.
+        """
         if self.config.unsafe_price is None:
             return losses.penalised_q(q_reward, cost, limit)
         price = self.config.unsafe_price * net.reward_scale / self.task.cost_range

@@ -1,20 +1,24 @@
-"""Implicit Q-learning (IQL), for rewards only: what CIQL and C2IQL start from.
+"""Implicit Q-learning (IQL). It maximises the reward only, and CIQL and C2IQL are built on it.
 
 Sources: Kostrikov, Nair and Levine 2022; equations 6, 7 and 8 of the C2IQL paper.
 
 Departures:
 
-1. All networks step at once on losses of the same, old parameters. IQL's code updates V first, then the
-   policy, then Q. At these learning rates the difference is one step's worth.
-2. A time limit ends the backup (`reward_time_limits`), as in OSRL; IQL's code bootstraps through it.
+1. All networks step at once, on losses of the same parameters. IQL's code updates V first, then the policy,
+   then Q. At these learning rates the difference is one step.
+2. The target of Q ends at a time limit (`reward_time_limits`), as in OSRL's code. IQL's code bootstraps
+   through it.
 """
 
 from dataclasses import dataclass
 from typing import Annotated
 
+from torch import Tensor, nn
+
 from tutorial_lib import losses
 from tutorial_lib.agents.critic import reward_guess
 from tutorial_lib.agents.implicit import ImplicitAgent, ImplicitConfig
+from tutorial_lib.agents.seeds import Fields, Networks
 from tutorial_lib.config import NOT_NEGATIVE
 from tutorial_lib.networks import Critics, Policy, Value, gaussian_log_prob
 
@@ -24,12 +28,12 @@ class IQLConfig(ImplicitConfig):
     """The options of IQL."""
 
     awr_alpha: Annotated[float, NOT_NEGATIVE] = 3.0
-    """Temperature of the policy extraction (eq. 8), on rewards scaled to a range of returns of 1000
-    (IQL's)."""
+    """The factor alpha of the policy extraction (eq. 8), for rewards that are scaled so that returns have a
+    range of 1000. Both numbers are those of IQL's code."""
 
 
 class IQL(ImplicitAgent):
-    """Equations 6, 7 and 8. It takes no limit: it is the family's unconstrained member."""
+    """IQL, equations 6, 7 and 8. It takes no limit, because it ignores the cost."""
 
     name = "IQL"
     Config = IQLConfig
@@ -42,7 +46,7 @@ class IQL(ImplicitAgent):
     }
     config: IQLConfig
 
-    def build(self):
+    def build(self) -> dict[str, nn.Module | Tensor]:
         task, config = self.task, self.config
         scale = reward_guess(task, config)
         return super().build() | {
@@ -51,7 +55,7 @@ class IQL(ImplicitAgent):
             "policy": Policy(task.obs_dim, task.act_dim, config),
         }
 
-    def losses(self, net, batch):
+    def losses(self, net: Networks, batch: Fields) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
         config, a = self.config, batch.actions
         s = self.network_input(net, batch.observations, batch.limit)
         s_next = self.network_input(net, batch.next_observations, batch.limit)

@@ -1,7 +1,7 @@
-"""How a function of one run's tensors becomes a function of S runs' tensors, which are stacked.
+"""Turns a function of one run's tensors into a function of the stacked tensors of S runs.
 
-The tensors of S runs are stacked along a new first axis, and torch.func.vmap evaluates the function of one
-run for all of them at once.
+The tensors of S runs are stacked along a new first axis, and torch.func.vmap computes the function of one run
+for all of them at once.
 """
 
 import copy
@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from torch.func import vmap
 
 KINDS = ("parameters", "buffers")
+"""The two kinds of tensors that a network has."""
 Tensors = dict[str, Tensor]
 """Tensors by name: the parameters and buffers of one network."""
 
@@ -29,27 +30,29 @@ class Place(NamedTuple):
 
 
 class Borrower:
-    """A network without tensors of its own: it computes with the parameters and buffers that it is lent.
+    """A network without its own tensors. It computes with the parameters and buffers that it is lent.
 
-    torch.func.functional_call does the same, but looks up every name at every call. For networks of profile
-    `small` that was an eighth of an update's time.
+    torch.func.functional_call does the same, but looks up every name at every call. With the networks of
+    profile `small` this took 1/8 of the time of an update. Raises ValueError for a network that cannot be
+    lifted (see `refuse_hidden_state`).
     """
 
     def __init__(self, module: nn.Module):
         refuse_hidden_state(module)
         self.module = copy.deepcopy(module)
         self.places: list[Place] = []
-        first_name: dict[Tensor, str] = {}  # a tensor that stands in two places is one parameter
+        first_name: dict[Tensor, str] = {}  # a tensor in two places is one parameter
         for prefix, layer in self.module.named_modules():
             for own in (layer._parameters, layer._buffers):
-                for attribute in [key for key, tensor in own.items() if tensor is not None]:  # no bias: None
+                # A layer without a bias has None in its place.
+                for attribute in [key for key, tensor in own.items() if tensor is not None]:
                     name = f"{prefix}.{attribute}" if prefix else attribute
                     tensor = own.pop(attribute)
                     assert tensor is not None
                     self.places.append(Place(first_name.setdefault(tensor, name), vars(layer), attribute))
 
     def lend(self, tensors: Tensors) -> nn.Module:
-        """The network with these tensors, by their names, until others are lent."""
+        """Returns the network, which computes with these tensors, by name, until others are lent."""
         for name, attributes, attribute in self.places:
             attributes[attribute] = tensors[name]
         return self.module
@@ -69,16 +72,16 @@ def refuse_hidden_state(module: nn.Module) -> None:
 
 
 def stacked(modules: list[nn.Module], kind: str) -> Tensors:
-    """`kind` ("parameters" or "buffers") of one network in S runs, by name, each (S, ...)."""
+    """Returns the tensors of one network in S runs by name, each (S, ...). `kind` is one of `KINDS`."""
     runs = [dict(getattr(module, f"named_{kind}")()) for module in modules]
     return {name: torch.stack([run[name].detach() for run in runs]) for name in runs[0]}
 
 
 def over_runs(function: Callable, runs: int) -> Callable:
-    """`function` of one run's tensors, for S runs: arguments and results get a first axis of S.
+    """Returns `function`, which is written for one run, for S runs.
 
-    Arguments and results are (nested) dicts of tensors. A single run is computed without vmap, which costs
-    time.
+    Its arguments and results get a first axis of length S. They are dicts or tuples of tensors, which may be
+    nested. A single run is computed without vmap, because vmap takes extra time.
     """
     if runs > 1:
         return vmap(function)
@@ -92,7 +95,7 @@ def over_runs(function: Callable, runs: int) -> Callable:
 
 
 def map_tensors(tree: Any, function: Callable[[Tensor], Tensor]) -> Any:
-    """The same nesting of dicts and tuples with `function` applied to every tensor."""
+    """Returns the same nested dicts and tuples, with `function` applied to every tensor."""
     if isinstance(tree, dict):
         return {key: map_tensors(value, function) for key, value in tree.items()}
     if isinstance(tree, tuple):
@@ -101,7 +104,7 @@ def map_tensors(tree: Any, function: Callable[[Tensor], Tensor]) -> Any:
 
 
 def clip_gradients(parameters: Iterable[Tensor], largest: float) -> None:
-    """Scales the gradients of one network, each (S, ...), so that no run's norm exceeds `largest`."""
+    """Scales one network's gradients, each (S, ...), so that no run's norm is larger than `largest`."""
     gradients = [p.grad for p in parameters if p.grad is not None]
     squares = [g.flatten(1).square().sum(1) if g.ndim > 1 else g.square() for g in gradients]
     norm = torch.stack(squares).sum(0).sqrt()  # (S,)
@@ -111,7 +114,7 @@ def clip_gradients(parameters: Iterable[Tensor], largest: float) -> None:
 
 
 def flat_names(tensors: dict[str, Tensors], prefix: str) -> Iterator[tuple[str, Tensor]]:
-    """Every tensor of several networks with the name that files use: `prefix.network.name`."""
+    """Yields every tensor of several networks with the name that files use, `prefix.network.name`."""
     for network, of_network in tensors.items():
         for name, tensor in of_network.items():
             yield f"{prefix}.{network}.{name}", tensor

@@ -1,4 +1,4 @@
-"""An agent while it plays: what a rollout asks for actions, and tells what they led to."""
+"""A player is an agent that plays episodes. A rollout asks it for actions and gives it rewards and costs."""
 
 from __future__ import annotations
 
@@ -14,9 +14,8 @@ if TYPE_CHECKING:
 class Player:
     """One run of an agent that plays E episodes at once, each under its limit.
 
-    This player has no memory: it plays the mean action. An algorithm that remembers what was spent, or that
-        plays
-    by chance, has a player of its own (`Agent.player`).
+    This player has no memory and plays the mean action. An algorithm that remembers past costs, or that plays
+    random actions, defines its own player (`Agent.player`). `limits` are (E,), in cost per episode.
     """
 
     def __init__(self, agent: Agent, limits: Sequence[float] | np.ndarray, run: int = 0):
@@ -24,16 +23,19 @@ class Player:
 
     @property
     def told(self) -> np.ndarray:
-        """The limit that the policy is told at this step, (E,); NaN: its policy takes none."""
+        """The limit that the policy is told at this step, (E,). It is NaN if the policy takes none."""
         return np.full(len(self.limits), np.nan)
 
     def act(self, observations: np.ndarray) -> np.ndarray:
-        """Actions (E, act) at observations (E, obs)."""
+        """Returns actions (E, act) at observations (E, obs)."""
         return self.agent.act(observations, self.told, self.run)
 
     def see(self, rewards: np.ndarray, costs: np.ndarray) -> None:
-        """Hear of the rewards and costs (E,) of the step that `act` chose; zeros where an episode is over."""
+        """Receives the rewards and costs (E,) of the step that `act` chose.
+
+        They are zero where an episode is over.
+        """
 
     def predicted_cost(self, observations: np.ndarray) -> np.ndarray:
-        """The cost of an episode that the agent expects of its action now, (E,); NaN: it cannot tell."""
+        """Returns the cost of an episode that the agent predicts at observations (E, obs), (E,), or NaN."""
         return self.agent.predicted_cost(observations, self.limits, self.run)

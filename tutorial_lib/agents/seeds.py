@@ -1,8 +1,8 @@
-"""Many seeds as one: the tensors of S runs of one algorithm, one update of all of them, and their state.
+"""Trains S runs of one algorithm together: it holds, updates and saves their tensors.
 
-An algorithm's `build`, `losses` and `step` speak of one run. Here their tensors are stacked along a first
-axis, and the functions are lifted over the stack (see `lift`). Runs share no parameter, so the gradient of
-the sum of their losses gives each run its own gradient.
+An algorithm's `build`, `losses` and `step` are written for one run. Here the tensors of S runs are stacked
+along a first axis, and the functions are lifted over the stack (see `lift`). Runs share no parameter, so the
+gradient of the sum of their losses gives each run its own gradient.
 """
 
 from collections.abc import Sequence
@@ -17,63 +17,74 @@ from tutorial_lib.agents import lift
 from tutorial_lib.config import Config
 
 Networks = SimpleNamespace
-"""What `losses` and `step` see of one run, by name: the networks and variables of `build`, the target
-networks as `target_NAME`, and the networks listed in `frozen` as `frozen_NAME`, whose parameters get no
-gradient there."""
+"""The networks of one run that `losses` and `step` get, by name. They are the networks and variables of
+`build`, the target networks as `target_NAME`, and the networks listed in `frozen` as `frozen_NAME`, whose
+parameters get no gradient."""
 Fields = SimpleNamespace
-"""What `losses` and `step` see of one run's batch: everything that `draw` returned, by name."""
+"""The batch of one run that `losses` and `step` get: everything that `draw` returned, by name."""
 
 
 class Rates(NamedTuple):
-    """How Adam changes one network."""
+    """How Adam trains one network."""
 
     lr: float
     """The learning rate."""
     weight_decay: float = 0.0
-    """Decoupled, as in AdamW."""
+    """The weight decay, decoupled from the gradient as in AdamW."""
     clip: float | None = None
-    """The largest norm of one run's gradient of this network; None: any."""
+    """The largest norm that one run's gradient of this network may have. With None there is no bound."""
     cosine: bool = False
-    """Does the learning rate decay to zero along a half cosine?"""
+    """If true, the learning rate decays to zero along a half cosine."""
     warm_up: int = 0
-    """Updates over which the learning rate rises linearly from zero."""
+    """The number of updates over which the learning rate rises linearly from zero."""
 
     def at(self, update: int, updates: int) -> float:
-        """The learning rate at an update, counted from zero, of so many."""
+        """Returns the learning rate at an update, counted from zero, of a run of `updates` updates."""
         cosine = 0.5 * (1 + np.cos(np.pi * min(update / updates, 1))) if self.cosine else 1.0
         return self.lr * cosine * min((update + 1) / self.warm_up, 1.0) if self.warm_up else self.lr * cosine
 
 
 class Runs:
-    """The tensors of S runs. `agent.Agent` says what an algorithm writes."""
+    """The tensors of S runs. `agent.Agent` says what an algorithm must define."""
 
     config: Config
+    """The options, which are the same in all runs."""
     seeds: tuple[int, ...]
+    """The seed of each run, (S,)."""
     device: torch.device
+    """The device of all tensors."""
     targets: ClassVar[tuple[str, ...]] = ()
-    """Networks that have a copy which follows them slowly (`tau`)."""
+    """The networks that have a target network, a copy that follows them with Polyak step `tau`."""
     frozen: ClassVar[tuple[str, ...]] = ()
-    """Networks that some loss looks through without training them."""
+    """The networks through which a loss needs a gradient although it does not train them."""
     steps_variables: bool
-    """Does the algorithm write `step`?"""
+    """True if the algorithm defines `step`."""
 
     def build(self) -> dict[str, nn.Module | Tensor]:
+        """Returns the networks and variables of one run (see `Agent.build`)."""
         raise NotImplementedError
 
     def losses(self, net: Networks, batch: Fields) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        """Returns one run's losses and scalars (see `Agent.losses`)."""
         raise NotImplementedError
 
     def step(self, net: Networks, batch: Fields, scalars: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Returns new values of one run's variables (see `Agent.step`)."""
         raise NotImplementedError
 
     def optimiser(self, name: str) -> Rates:
+        """Returns how Adam trains a network (see `Agent.optimiser`)."""
         raise NotImplementedError
 
     def tau(self, name: str) -> float:
+        """Returns the Polyak step of a target network (see `Agent.tau`)."""
         raise NotImplementedError
 
     def build_runs(self) -> None:
-        """Make the tensors of all runs, each drawn with its seed, and Adam for those that are trained."""
+        """Makes the tensors of all runs, each with the random numbers of its seed, and their optimiser.
+
+        Raises ValueError for a network that cannot be lifted (see `lift.refuse_hidden_state`).
+        """
         runs = [self._build_seeded(seed) for seed in self.seeds]
         networks: dict[str, Any] = {}
         variables: dict[str, Any] = {}
@@ -111,12 +122,11 @@ class Runs:
         self.updates = 0
 
     def update(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
-        """One gradient step of every run on what `draw` returned, stacked: (S, ...). Returns scalars (S,).
+        """Makes one gradient step of every run on what `draw_all` returned, and returns scalars (S,).
 
-        All losses look at the same, old parameters, then all networks step at once: the policy and the
-        All losses look at the same, old parameters, then all networks step at once: the policy and the
-        targets of Q see V from before this step. (IQL's code updates V first. At these learning rates the
-        difference is one step's worth, and one joint step is faster.)
+        All losses are computed from the same parameters, and then all networks step at once. So the policy
+        and the targets of Q see V from before this step. (IQL's code updates V first. At these learning rates
+        the difference is one step, and one joint step is faster.)
         """
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.config.precision == "bfloat16"):
             loss, scalars = self._lifted(self._tensors(), batch)
@@ -136,15 +146,17 @@ class Runs:
         return scalars
 
     def networks(self, run: int = 0) -> Networks:
-        """The networks and variables of one run, as `losses` sees them, for use without gradients."""
+        """Returns the networks and variables of one run, as `losses` sees them, for use without gradients."""
         if run not in self._acting:
             own = lift.map_tensors(self._tensors(), lambda x: x[run].detach())
             self._acting[run] = self._net(own, self._make_borrowers())
         return self._acting[run]
 
     def fill_last_bias(self, names: Sequence[str], values: Sequence[float]) -> None:
-        """Set the output bias, the last parameter, of these networks and of their targets: one value per
-        run."""
+        """Sets the output bias of these networks and of their target networks to one value per run, (S,).
+
+        The output bias is the last parameter of a network.
+        """
         with torch.no_grad():
             for parameters in (self.parameters, self.target_parameters):
                 for name in set(names) & set(parameters):
@@ -152,7 +164,7 @@ class Runs:
                         bias.fill_(value)
 
     def state(self) -> dict[str, Tensor]:
-        """Every tensor by a flat name: online.*, buffer.*, target.*, variable.*, adam.* and updates."""
+        """Returns all tensors by flat names: online.*, buffer.*, target.*, variable.*, adam.* and updates."""
         parts = {"online": self.parameters, "buffer": self.buffers, "target": self.target_parameters}
         tensors = {
             name: tensor.detach()
@@ -165,18 +177,18 @@ class Runs:
         return tensors | {"updates": torch.tensor(self.updates)}
 
     def load_state(self, tensors: dict[str, Tensor]) -> None:
-        """The inverse of `state`. Without adam.* and target.* the agent can act, but not continue its
-        training.
+        """Sets all tensors to those that `state` returned.
 
-        Raises KeyError for a missing tensor, ValueError for one of another shape.
+        If adam.* and target.* are missing, the agent can act, but it cannot continue its training. Raises
+        KeyError for a missing tensor, and ValueError for a tensor of another shape.
         """
         with torch.no_grad():
             for name, place in self.state().items():
                 if name.startswith(("adam.", "updates")):
                     continue
-                online = name.replace("target.", "online.", 1)  # a file to act from has no target networks
+                online = name.replace("target.", "online.", 1)  # files of `save_agent` have no target.*
                 value = tensors[name if name in tensors or name == online else online]
-                if value.shape != place.shape:  # copy_ would repeat one run for all
+                if value.shape != place.shape:  # otherwise copy_ would copy one run to all
                     raise ValueError(f"{name} has shape {tuple(value.shape)}, not {tuple(place.shape)}")
                 place.copy_(value)
         state = self.adam.state_dict() | {"state": {}}
@@ -188,7 +200,7 @@ class Runs:
         self.updates = int(tensors["updates"])
 
     def __getstate__(self) -> dict[str, Any]:
-        """What a worker process needs to act: everything but the optimiser and the lent networks."""
+        """Returns what a worker process needs to act: everything but the optimiser and the lent networks."""
         left = ("adam", "_borrowers", "_lifted", "_acting")
         return {key: value for key, value in vars(self).items() if key not in left} | {"_acting": {}}
 
@@ -204,7 +216,7 @@ class Runs:
         return {name: lift.Borrower(self.modules[network]) for name, network in of.items()}
 
     def _tensors(self) -> dict[str, dict]:
-        """All tensors of all runs, (S, ...), as nested dicts."""
+        """Returns all tensors of all runs, (S, ...), as nested dicts."""
         return {
             "online": self.parameters,
             "target": self.target_parameters,
@@ -213,7 +225,7 @@ class Runs:
         }
 
     def _net(self, own: dict[str, dict], borrowers: dict[str, lift.Borrower]) -> Networks:
-        """What `losses` sees of one run, from that run's tensors."""
+        """Returns what `losses` sees of one run, from that run's tensors."""
         online, buffers = own["online"], own["buffer"]
         lent = {name: params | buffers[name] for name, params in online.items()}
         lent |= {f"target_{name}": params | buffers[name] for name, params in own["target"].items()}
@@ -223,14 +235,14 @@ class Runs:
         return Networks(**nets, **own["variable"])
 
     def _total(self, own: dict[str, dict], batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
-        """One run's losses, summed, and its scalars, as a function of its tensors."""
+        """Returns the sum of one run's losses, and its scalars, from its tensors and its batch."""
         losses, scalars = self.losses(self._net(own, self._borrowers), Fields(**batch))
         scalars = {f"{name}_loss": loss for name, loss in losses.items()} | scalars
         total: Any = sum(losses.values())
         return total, {name: value.detach() for name, value in scalars.items()}
 
     def _step_variables(self, batch: dict[str, Tensor], scalars: dict[str, Tensor]) -> None:
-        """Give every run the new values of its variables."""
+        """Gives the variables of every run the values that `step` returns."""
         if not self.steps_variables:
             return
 

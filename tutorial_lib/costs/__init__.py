@@ -1,1 +1,1 @@
-"""What C2IQL knows of undiscounted cost: discounting, cost reconstruction and constraint conditioning."""
+"""The parts of C2IQL for undiscounted cost: discounting, cost reconstruction and constraint conditioning."""

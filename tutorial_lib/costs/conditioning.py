@@ -1,4 +1,7 @@
-"""Constraint conditioning (Section 3.4): the threshold set, its encoding, and the budget rule, eq. 23."""
+"""Constraint conditioning (Section 3.4): the threshold set, its encoding and the budget rule (eq. 23).
+
+Limits, budgets and costs are in unsafe steps per episode.
+"""
 
 import math
 from dataclasses import dataclass
@@ -6,6 +9,7 @@ from typing import Literal
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor
 
 from tutorial_lib.config import Config
@@ -17,39 +21,44 @@ class ConditioningConfig(Config):
     """The options of constraint conditioning."""
 
     thresholds_per: Literal["sample", "batch"] = "sample"
-    """One threshold per transition (lower variance), or one per batch, as Algorithm 2's line 5 reads."""
+    """Whether one threshold is drawn per transition ('sample') or per batch ('batch'). Line 5 of Algorithm 2
+    can be read as one per batch. One per transition has the lower variance."""
     zero_threshold: bool = False
-    """Does the threshold set {small, middle, high, infinity} hold a zero, too? It is what an agent is told
-    whose budget is spent. Without it the budget rule, eq. 23, can ask for no less than the small threshold's
-    rate."""
+    """If true, the threshold set {small, middle, high, infinity} also contains zero, and an agent is told
+    zero when its budget is spent. Without zero, the budget rule (eq. 23) cannot ask for a lower cost rate
+    than that of the small threshold."""
     infinite_at_test: Literal["covered", "nearest", "never"] = "covered"
-    """When the budget rule tells the policy an infinite threshold. 'covered': once the budget left covers the
-    largest cost of every step left, since nothing can then break the limit; 'nearest': where its code is
-    closest to the rescaled budget; 'never': 'the closest value' is finite."""
+    """When the budget rule tells the policy an infinite threshold. With 'covered', this is when the budget
+    covers the largest cost of every remaining step, because nothing can then break the limit. With 'nearest',
+    it is when the code of infinity (1.5 cost ranges) is the closest to the rescaled budget. With 'never', the
+    paper's "closest value" is always finite."""
 
     profiles = {"small": {"zero_threshold": True}}
 
 
 INFINITE_CODE = 1.5
-"""Paper silent: an infinite threshold enters the networks as 1.5 cost ranges, above every finite one."""
+"""The code of an infinite threshold, in cost ranges, above every finite one. The paper does not give it."""
 
 
 def threshold_set(task: Task, with_zero: bool = False) -> np.ndarray:
-    """The set {small, middle, high, infinity} of Appendix B.2, (4,), or with a zero before them, (5,)."""
+    """Returns {small, middle, high, infinity} (Appendix B.2), (4,), or with a zero before them, (5,)."""
     return np.array([*([0.0] if with_zero else []), *task.thresholds, math.inf])
 
 
-def encode(threshold, task: Task) -> Tensor:
-    """Thresholds as network inputs: in units of the task's cost range, so that they are of order one."""
+def encode(threshold: Tensor | np.ndarray | float, task: Task) -> Tensor:
+    """Returns thresholds of any shape as network inputs, in units of the task's cost range.
+
+    So they are of order one. Infinity becomes `INFINITE_CODE`.
+    """
     threshold = torch.as_tensor(threshold, dtype=torch.float32)
     return torch.where(threshold.isinf(), INFINITE_CODE, threshold / task.cost_range)
 
 
 def draw_thresholds(task: Task, config: ConditioningConfig, generator: torch.Generator) -> Tensor:
-    """Thresholds for one run's batch, drawn uniformly from the threshold set, (batch_size,).
+    """Returns thresholds for one run's batch, drawn uniformly from the threshold set, (batch_size,) (line 5).
 
-    The paper does not say whether line 5 draws one per batch or one per sample; per sample has the lower
-    variance.
+    The paper does not say whether it draws one per batch or one per transition. One per transition has the
+    lower variance.
     """
     choices = torch.as_tensor(threshold_set(task, with_zero=config.zero_threshold), dtype=torch.float32)
     draws = config.batch_size if config.thresholds_per == "sample" else 1
@@ -57,32 +66,37 @@ def draw_thresholds(task: Task, config: ConditioningConfig, generator: torch.Gen
 
 
 def check_limit(limit: float) -> float:
-    """The limit itself, or ValueError: a limit on a cost is a number of at least zero."""
+    """Returns the limit as a float. Raises ValueError if it is negative or NaN."""
     if not limit >= 0:
         raise ValueError(f"a limit on the cost must be zero or more, not {limit}")
     return float(limit)
 
 
-def rescaled_budget(limit, spent, t: int, horizon: int) -> np.ndarray:
-    """Eq. 23: what is left of the limit, spread over the steps left, as a limit on a whole episode.
+def rescaled_budget(limit: ArrayLike, spent: np.ndarray | float, t: int, horizon: int) -> np.ndarray:
+    """Returns (limit - spent) T / (T - t) (eq. 23), with the shape to which `limit` and `spent` broadcast.
 
-    It grows without bound as t -> T and is negative once overspent: `nearest_threshold` clamps both ends.
+    This is the limit on a whole episode that has the same cost rate as the budget has over the remaining
+    steps. It grows without bound as t -> T, and it is negative if more was spent than the limit.
+    `nearest_threshold` clamps both. Raises ValueError if t is not a step of the episode.
     """
     if not 0 <= t < horizon:
         raise ValueError(f"step {t} is not in an episode of {horizon} steps")
     return (np.asarray(limit, float) - spent) * horizon / (horizon - t)
 
 
-def nearest_threshold(budget, task: Task, with_infinite: bool = False, with_zero: bool = False) -> np.ndarray:
-    """The element of the threshold set closest to each budget.
+def nearest_threshold(
+    budget: np.ndarray, task: Task, with_infinite: bool = False, with_zero: bool = False
+) -> np.ndarray:
+    """Returns the element of the threshold set that is closest to each budget, with the shape of `budget`.
 
-    A budget below the smallest threshold, or negative, gets the smallest; one above the largest, the
-    largest. With `with_infinite`, infinity stands where its code does, at 1.5 cost ranges; with `with_zero`,
-    0 is the smallest.
+    A budget below the smallest threshold gets the smallest one, and a budget above the largest threshold gets
+    the largest one. With `with_infinite`, infinity is in the set, and its distance is measured from its code,
+    1.5 cost ranges. With `with_zero`, zero is in the set.
     """
     choices = threshold_set(task, with_zero)[: None if with_infinite else -1]
     places = np.where(np.isinf(choices), INFINITE_CODE * task.cost_range, choices)
-    budget = np.clip(np.asarray(budget, float), places[0], places[-1])  # infinity is as far from all
+    # Without the clip, an infinite budget would be equally far from all places.
+    budget = np.clip(np.asarray(budget, float), places[0], places[-1])
     distance = np.abs(budget[..., None] - places)
     return choices[distance.argmin(axis=-1)]
 
@@ -95,11 +109,11 @@ def told_limit(
     t: int,
     remaining: bool = False,
 ) -> np.ndarray:
-    """What a conditioned policy is told at step t, (E,): eq. 23, then the nearest element of the threshold
-    set.
+    """Returns the limit that a conditioned policy is told at step t, (E,).
 
-    `limits` (E,) are the limits of E episodes, `spent` (E,) what each has cost so far. `remaining`: the
-    critics speak of the cost that remains, not of a whole episode's, so the budget is not rescaled.
+    It is the element of the threshold set that is nearest to the rescaled budget of eq. 23. `limits` (E,) are
+    the limits of E episodes, and `spent` (E,) is what each has cost so far. With `remaining`, the critics
+    predict the remaining cost and not that of a whole episode, so the budget is not rescaled.
     """
     budget = limits - spent if remaining else rescaled_budget(limits, spent, t, task.horizon)
     chosen = nearest_threshold(

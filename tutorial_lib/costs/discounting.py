@@ -1,64 +1,81 @@
-"""Discounted against undiscounted cost: sums, the average threshold, and who is misjudged (Section 3.2)."""
+"""Discounted and undiscounted cost: sums, the average threshold, and misjudged episodes (Section 3.2).
 
-from typing import NamedTuple
+Undiscounted costs and limits are in unsafe steps per episode.
+"""
+
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from tutorial_lib.data.dataset import Dataset
 
 
-def discounted_sums(costs: np.ndarray, gammas) -> np.ndarray:
-    """sum_t gamma^t c_t of each sequence for each gamma: costs (..., T) and m gammas give (..., m)."""
+def discounted_sums(costs: np.ndarray, gammas: ArrayLike) -> np.ndarray:
+    """Returns sum_t gamma^t c_t, (..., m), of sequences of costs (..., T) for m discount factors gammas."""
     powers = np.power.outer(np.asarray(gammas, float), np.arange(costs.shape[-1]))  # (m, T)
     return costs @ powers.T
 
 
-def average_threshold(limit, gamma: float, horizon: int):
-    """Eq. 2's L~ = (L / T) (1 - gamma^T) / (1 - gamma): the discounted sum of a steady L / T per step."""
+def average_threshold(limit: Any, gamma: float, horizon: int) -> Any:
+    """Returns L~ = (L / T) (1 - gamma^T) / (1 - gamma) (eq. 2), in discounted cost.
+
+    This is the discounted sum of a constant cost of L / T per step. `limit` is a number, an array or a
+    tensor, and the result has its type and shape. Raises ValueError if gamma is not in (0, 1).
+    """
     if not 0 < gamma < 1:
         raise ValueError(f"gamma must lie in (0, 1), not {gamma}")
     return limit / horizon * (1 - gamma**horizon) / (1 - gamma)
 
 
 def cost_sequences(dataset: Dataset, horizon: int) -> np.ndarray:
-    """The costs of a dataset's episodes, (episodes, horizon) float32: one cut short costs nothing more."""
+    """Returns the costs of a dataset's episodes, (episodes, horizon) float32.
+
+    After the end of an episode that is shorter than the horizon, its costs are zero.
+    """
     costs = np.zeros((dataset.num_episodes, horizon), np.float32)
     for row, start, end in zip(costs, dataset.starts, dataset.ends, strict=True):
         row[: end - start] = dataset.costs[start:end]
     return costs
 
 
-def settled_share(gamma, updates, tau: float):
-    """The share of a steady cost's value that a critic can have learned after so many updates, from zero.
+def settled_share(gamma: ArrayLike, updates: ArrayLike, tau: float) -> np.ndarray:
+    """Returns 1 - (1 - tau (1 - gamma))^updates, the largest share of its value that a critic can have.
 
-    Its targets come from a copy that follows with Polyak step `tau`. Each update, the best that a critic
-    can do is to meet its target c + gamma q; then the copy's error shrinks by 1 - tau (1 - gamma), and
-    real critics are slower. With arrays: broadcast.
+    The critic starts at zero, the cost per step is constant, and the target network has the Polyak step
+    `tau`. At best, the critic meets its target c + gamma q at each update. Then the error of the target
+    network is multiplied by 1 - tau (1 - gamma). Real critics are slower. `gamma` and `updates` broadcast.
     """
     return 1 - (1 - tau * (1 - np.asarray(gamma))) ** np.asarray(updates)
 
 
 class Misjudged(NamedTuple):
-    """Shares of all sequences (Fig. 1): safe but rejected, and unsafe but accepted."""
+    """The shares of all sequences that an estimate of the cost misjudges (Fig. 1)."""
 
     false_positives: float
+    """The share of sequences that are safe and rejected."""
     false_negatives: float
+    """The share of sequences that are unsafe and accepted."""
 
 
 def misjudged(cost: np.ndarray, estimate: np.ndarray, limit: float, estimate_limit: float) -> Misjudged:
-    """Compare cost <= limit, the truth, with estimate <= estimate_limit, its stand-in; both (n,)."""
+    """Returns how often estimate <= estimate_limit differs from cost <= limit, the truth.
+
+    `cost` and `estimate` are (n,), one number per sequence.
+    """
     safe, accepted = cost <= limit, estimate <= estimate_limit
     return Misjudged(float(np.mean(safe & ~accepted)), float(np.mean(~safe & accepted)))
 
 
 def random_cost_sequences(
-    kind: str, n: int, horizon: int, rng: np.random.Generator, largest=None
+    kind: str, n: int, horizon: int, rng: np.random.Generator, largest: int | None = None
 ) -> np.ndarray:
-    """n sequences of 0/1 costs, (n, horizon) float32; totals are uniform on 0..largest (default: horizon).
+    """Returns n random sequences of 0/1 costs, (n, horizon) float32.
 
-    The paper's generator is unstated and decides how much discounting misjudges, so there are three:
-    'uniform' costs fall at any time; 'block' in one contiguous stretch; 'beta' early, late or in the
-    middle, at times drawn from a random Beta distribution.
+    Their sums are uniform on 0..largest (default: horizon). The paper does not describe its generator, and
+    the share of misjudged sequences depends on it, so there are three kinds. With 'uniform', costs are at any
+    time. With 'block', they are in one contiguous block. With 'beta', they are early, late or in the middle,
+    at times from a random Beta distribution. Raises ValueError for another kind.
     """
     totals = rng.integers(0, (horizon if largest is None else largest) + 1, size=(n, 1))
     time = np.arange(horizon)
@@ -74,6 +91,6 @@ def random_cost_sequences(
         log_density = (a - 1) * np.log(x) + (b - 1) * np.log1p(-x)
         score = -(log_density + rng.gumbel(size=(n, horizon)))
     else:
-        raise ValueError(f"unknown kind {kind!r}: 'uniform', 'block' or 'beta'")
+        raise ValueError(f"unknown kind {kind!r}: it must be 'uniform', 'block' or 'beta'")
     rank = score.argsort(axis=1).argsort(axis=1)
     return (rank < totals).astype(np.float32)

@@ -1,8 +1,8 @@
-"""The cost reconstruction model (Algorithm 1): m discounted sums in, the undiscounted sum out.
+"""The cost reconstruction model (Algorithm 1) predicts an undiscounted cost from m discounted costs.
 
-Whole-episode sums of the dataset and of random 0/1 sequences are its training data. Its baseline is
-linear least squares on the same data, which is nearly exact on clean inputs; the noise on the inputs
-keeps either from answering with large weights of alternating sign that amplify the critics' errors.
+It is trained on sums over the dataset's episodes and over random 0/1 sequences. Its baseline is linear least
+squares on the same data, which is nearly exact on inputs without noise. But without noise in the training
+inputs, both models learn large weights of alternating sign, which amplify the critics' errors.
 """
 
 from dataclasses import dataclass
@@ -20,7 +20,8 @@ from tutorial_lib.networks import Output, in_float32, mlp
 from tutorial_lib.tasks import Task
 
 POOL = 60_000
-"""Random sequences, drawn once: generating new ones for every batch costs more than learning from them."""
+"""The number of random sequences. They are drawn once, because to draw new ones for every batch would take
+longer than to learn from them."""
 
 
 @dataclass(frozen=True)
@@ -28,21 +29,22 @@ class ReconstructionConfig(Config):
     """The options of the cost reconstruction model (Appendix B.2)."""
 
     crm: Literal["mlp", "linear"] = "mlp"
-    """'linear' is the least-squares baseline on the same data and noise."""
+    """The kind of reconstruction model. 'linear' is the least-squares baseline on the same data and noise."""
     crm_width: Annotated[int, NOT_NEGATIVE] = 512
-    """Units of each hidden layer."""
+    """The number of units of each of its hidden layers."""
     crm_layers: Annotated[int, NOT_NEGATIVE] = 5
-    """Hidden layers; 0: a linear network, trained."""
+    """The number of its hidden layers. With 0, it is a linear network, which is trained."""
     crm_steps: Annotated[int, NOT_NEGATIVE] = 1_000_000
-    """Iterations of Algorithm 1. The paper says epochs, but one pass over random data has no end. A million
-    of them at 5 x 512 are twice the arithmetic of all updates; on whitened inputs 20,000 at 3 x 128 do
-    (`data/README.md`, "Profile `paper`")."""
+    """The number of iterations of Algorithm 1. The paper counts epochs, but random data have no epochs. With
+    5 layers of 512 units, a million iterations need twice the arithmetic of all updates. On whitened inputs,
+    20,000 iterations with 3 layers of 128 units are enough (`data/README.md`, "Profile `paper`")."""
     crm_noise: Annotated[float, NOT_NEGATIVE] = 0.1
-    """Standard deviation of the noise on the model's inputs, in discounted cost."""
+    """The standard deviation of the noise on the model's inputs, in discounted cost."""
     crm_noise_rate: Annotated[float, NOT_NEGATIVE] = 0.0
-    """More noise, in cost per step: head i gets this over 1 - gamma_i. The paper has none. The model should
-    expect the error that the critics make. Theirs is about 0.01 after some thousand updates, ten times what
-    0.1 allows for, and the model's weights, which alternate in sign, multiply it."""
+    """The standard deviation of a second noise, in cost per step: input i gets crm_noise_rate / (1 -
+    gamma_i), in discounted cost. The paper has no such noise. The model should be trained for the error that
+    the critics make. After some thousand updates this is about 0.01, ten times what `crm_noise=0.1` covers,
+    and the model's weights, which alternate in sign, amplify it."""
 
     profiles = {
         "small": {"crm_width": 64, "crm_layers": 2, "crm_steps": 5_000, "crm_noise_rate": 0.01},
@@ -55,17 +57,17 @@ class ReconstructionConfig(Config):
 
 
 class CostReconstruction(nn.Module):
-    """R^c of eq. 21: discounted costs (..., m) to an undiscounted cost (...,).
+    """R^c of eq. 21, which predicts an undiscounted cost from m discounted costs.
 
-    Discounted sums of one sequence are nearly equal once scaled, and only their small differences tell
-    anything. So the inputs are whitened first (mean zero, uncorrelated, variance one on the noisy
-    training data): the same network then learns in thousands of steps what it else needs a million for.
+    Once scaled, the m discounted sums of one sequence are nearly equal, and all information is in their small
+    differences. So the inputs are whitened first: on the noisy training data they have mean zero and variance
+    one, and are uncorrelated. Then the same network learns in thousands of steps, and not in a million.
     """
 
     mean: Tensor
-    """Of the inputs, (m,)."""
+    """The mean of the inputs, (m,), in discounted cost."""
     whiten: Tensor
-    """The matrix that makes them uncorrelated with variance one, (m, m)."""
+    """The matrix that makes the inputs uncorrelated with variance one, (m, m)."""
 
     def __init__(self, task: Task, config: ReconstructionConfig):
         super().__init__()
@@ -76,18 +78,22 @@ class CostReconstruction(nn.Module):
         self.net = Output(m, 1) if config.crm == "linear" else mlp(m, config.crm_width, config.crm_layers, 1)
 
     def forward(self, discounted: Tensor) -> Tensor:
-        whitened = in_float32(lambda x: (x - self.mean) @ self.whiten, discounted)  # where all digits count
+        """Returns undiscounted costs (...,), in unsafe steps, of discounted costs (..., m)."""
+        whitened = in_float32(lambda x: (x - self.mean) @ self.whiten, discounted)  # needs all digits
         return self.net(whitened).squeeze(-1) * self.horizon
 
 
 def episode_sums(dataset: Dataset, task: Task) -> tuple[np.ndarray, np.ndarray]:
-    """Algorithm 1's line 3: discounted sums (episodes, m) and sums (episodes,) of the dataset's costs."""
+    """Returns discounted sums (episodes, m) and sums (episodes,) of the dataset's costs (line 3)."""
     costs = cost_sequences(dataset, task.horizon)
     return discounted_sums(costs, task.gammas), costs.sum(1)
 
 
 def random_sums(task: Task, n: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Lines 9-12: sums of n random sequences, a third each of uniform, block and Beta-shaped times."""
+    """Returns discounted sums (n, m) and sums (n,) of random 0/1 sequences (Algorithm 1, lines 9-12).
+
+    A third of the sequences is of each kind: 'uniform', 'block' and 'beta'.
+    """
     parts = [
         random_cost_sequences(kind, -(-n // 3), task.horizon, rng) for kind in ("uniform", "block", "beta")
     ]
@@ -96,7 +102,7 @@ def random_sums(task: Task, n: int, rng: np.random.Generator) -> tuple[np.ndarra
 
 
 def input_noise(task: Task, config: ReconstructionConfig) -> Tensor:
-    """Standard deviations of the noise on the m inputs, (m,), in discounted cost."""
+    """Returns the standard deviations of the noise on the m inputs, (m,), in discounted cost."""
     rate = config.crm_noise_rate / (1 - torch.tensor(task.gammas, dtype=torch.float64))
     return (config.crm_noise**2 + rate**2).sqrt()
 
@@ -106,10 +112,13 @@ def train_reconstruction(
     config: ReconstructionConfig,
     dataset: Dataset,
     seed: int = 0,
-    device="cpu",
+    device: torch.device | str = "cpu",
     progress: bool = True,
 ) -> CostReconstruction:
-    """Algorithm 1. Half of every batch are the dataset's episodes, half random sequences."""
+    """Returns a reconstruction model, trained by Algorithm 1 or, if `crm` is 'linear', by least squares.
+
+    One half of every batch are episodes of the dataset, and the other half are random sequences.
+    """
     rng = np.random.default_rng(seed)
     generator = torch.Generator().manual_seed(seed)
     with torch.random.fork_rng(devices=[]):
@@ -121,14 +130,14 @@ def train_reconstruction(
         for part in zip(*sums, strict=True)
     )
     half = [torch.full((len(part),), 0.5 / len(part), dtype=torch.float64) for _, part in sums]
-    share = torch.cat(half).to(device)  # episodes and random sequences count for a half each
+    share = torch.cat(half).to(device)  # the weights of episodes and of random sequences sum to 1/2 each
     model.mean.copy_(share @ x)
     centred = x - share @ x
     noise_std = input_noise(task, config).to(x)
     covariance = centred.mT @ (share[:, None] * centred) + torch.diag(noise_std.square())
     model.whiten.copy_(torch.linalg.inv(torch.linalg.cholesky(covariance)).mT)
     if config.crm == "linear":
-        # With whitened inputs, least squares is a mean; the noise in the covariance is its ridge penalty.
+        # With whitened inputs, least squares is a mean, and the noise in the covariance is a ridge penalty.
         with torch.no_grad():
             white = centred @ model.whiten.to(x)
             weight, bias = model.net.parameters()
@@ -147,7 +156,7 @@ def train_reconstruction(
         noise = torch.randn(len(rows), x.shape[1], generator=generator)
         rows, noise = (draw.to(device, non_blocking=True) for draw in (rows, noise))
         noise = noise_std.float() * noise
-        loss = (model(x[rows] + noise) - y[rows]).square().mean() / task.horizon**2  # lines 7 and 14 at once
+        loss = (model(x[rows] + noise) - y[rows]).square().mean() / task.horizon**2  # lines 7 and 14
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
@@ -158,9 +167,10 @@ def train_reconstruction(
 def reconstruction_error(
     model: CostReconstruction, task: Task, config: ReconstructionConfig, dataset: Dataset, seed: int = 1
 ) -> float:
-    """Root of the mean squared error, in cost, on the noise that the model was trained for.
+    """Returns the root of the model's mean squared error, in unsafe steps per episode.
 
-    Episodes of the dataset and 10,000 new random sequences count for a half each, as in training.
+    The inputs have the noise that the model was trained for. As in training, the episodes of the dataset and
+    10,000 new random sequences count for one half each.
     """
     rng, generator = np.random.default_rng(seed), torch.Generator().manual_seed(seed)
     noise = input_noise(task, config).float()

@@ -1,1 +1,1 @@
-"""What only the notebooks use: figures, checks, sliders and small worlds. Nothing else imports it."""
+"""What only the notebooks need: figures, checks, sliders and small CMDPs. No other package imports it."""

@@ -1,9 +1,11 @@
-"""Notebook 07's agents: the shortcut in laps, a policy for each threshold, and the budget rule over them.
+"""The agents of notebook 07: one policy per threshold on the repeated shortcut, and the budget rule (eq. 23).
 
-Everything here is exact: chances are followed through all steps, budgets and cells; nothing is sampled.
+All results are exact. The probabilities of all states and spent costs are computed for every step, and
+nothing is sampled.
 """
 
 import dataclasses
+from collections.abc import Iterable
 
 import numpy as np
 
@@ -14,16 +16,17 @@ from tutorial_lib.tasks import get_task
 TASK = dataclasses.replace(
     get_task("BallCircle"), name="Laps", horizon=100, thresholds=(10, 25, 40), cost_range=60
 )
-"""What the budget rule must know of a task: its horizon, its thresholds and its cost range."""
+"""The task of the laps. The budget rule reads its horizon (100 steps), its thresholds and its cost range."""
 
 LEAST = 0.1
-"""No policy is cheaper than 0.04 per episode, because moves slip: the threshold 0 stands for this cost."""
+"""The cost of an episode that stands for the threshold 0. Moves slip, so no policy costs less than 0.04."""
 
 
-def policies(thresholds, bias: float = 1.0) -> dict[float, np.ndarray]:
-    """For each threshold the best policy, (S, A), that costs as much, times `bias`, per episode.
+def policies(thresholds: Iterable[float], bias: float = 1.0) -> dict[float, np.ndarray]:
+    """The best policy, (S, A), for each threshold L among those that cost `bias` L per episode.
 
-    A bias below one makes a thrifty agent, one above a spendthrift: it is told one limit and keeps another.
+    With a bias below one the agent spends less than the threshold that it is given, with a bias above one it
+    spends more.
     """
     cmdp = tabular.laps()
     costs = {float(limit): max(bias * limit, LEAST) for limit in thresholds}
@@ -31,14 +34,17 @@ def policies(thresholds, bias: float = 1.0) -> dict[float, np.ndarray]:
 
 
 def told(config: ConditioningConfig, limit: float) -> np.ndarray:
-    """The limit told at each step after each sum spent, (T, T+1), by `conditioning.told_limit`."""
+    """The limit given to the policy at each step after each cost spent so far, (T, T+1): eq. 23."""
     spent = np.arange(TASK.horizon + 1.0)
     limits = np.full(len(spent), float(limit))
     return np.stack([told_limit(TASK, config, limits, spent, t) for t in range(TASK.horizon)])
 
 
 def follow_rule(config: ConditioningConfig, agent: dict[float, np.ndarray], limit: float) -> tabular.Spending:
-    """What an agent, a policy per threshold, earns and pays as the budget rule tells it what is left."""
+    """What an agent earns and spends under a limit when the budget rule chooses its threshold at every step.
+
+    `agent` has a policy (S, A) for each threshold that can occur.
+    """
     thresholds = told(config, limit)
     choices, where = np.unique(thresholds, return_inverse=True)
     table = np.stack([agent[choice] for choice in choices])
@@ -47,5 +53,5 @@ def follow_rule(config: ConditioningConfig, agent: dict[float, np.ndarray], limi
 
 
 def follow_one(policy: np.ndarray) -> tabular.Spending:
-    """The same for one policy, (S, A), that is never told anything."""
+    """What a single policy (S, A), which does not depend on the budget, earns and spends."""
     return tabular.follow(tabular.laps(), TASK.horizon, lambda t: policy[None])

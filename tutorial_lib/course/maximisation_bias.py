@@ -1,4 +1,4 @@
-"""What a maximum does to values learned from recordings: a bandit, and tiny critics on a shipped dataset."""
+"""The bias of maxima over learned values, on a bandit and with small critics on a shipped dataset."""
 
 import copy
 from collections.abc import Callable
@@ -6,33 +6,35 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor
 
 from tutorial_lib.config import Config
 from tutorial_lib.data.dataset import Dataset, sample_batch
 from tutorial_lib.losses import expectile_loss, td_loss, td_target
 from tutorial_lib.networks import ActionDecoder, ActionEncoder, Critics, Value, latent_kl, vae_loss
-from tutorial_lib.tasks import make_env
+from tutorial_lib.tasks import Task, make_env
 
 
-def bandit_value(action):
-    """True mean reward of an action in [-1, 1]: the more the better, until at 0.3 one falls off a cliff."""
+def bandit_value(action: ArrayLike) -> np.ndarray:
+    """The true mean reward of actions in [-1, 1], in their shape: 1 + a if a < 0.3, and -1 otherwise."""
     return np.where(np.asarray(action) < 0.3, 1.0 + np.asarray(action), -1.0)
 
 
-def bandit_logs(rng: np.random.Generator, n: int = 40, noise: float = 0.2):
-    """n recorded actions, careful ones from -0.6 to 0.2, and their noisy rewards; both (n,)."""
+def bandit_logs(rng: np.random.Generator, n: int = 40, noise: float = 0.2) -> tuple[np.ndarray, np.ndarray]:
+    """n recorded actions between -0.6 and 0.2, where none is bad, and their rewards with noise; both (n,)."""
     actions = np.clip(rng.normal(-0.2, 0.15, n), -0.6, 0.2)
     return actions, bandit_value(actions) + rng.normal(0, noise, n)
 
 
 class Critic:
-    """Twin Q, their Polyak-averaged copies, and V: the library's networks, small enough for a lesson.
+    """Two Q networks, their Polyak averages (the target networks), and V: the library's networks, but narrow.
 
-    Every network starts near `scale`; observations are standardised as the dataset's are.
+    The output of every network starts near `scale`. Observations are standardised with the mean and the
+    standard deviation of the dataset's.
     """
 
-    def __init__(self, dataset: Dataset, scale: float, width: int = 64, seed: int = 0):
+    def __init__(self, dataset: Dataset, scale: float, width: int = 64, seed: int = 0) -> None:
         obs, act, config = dataset.observations.shape[1], dataset.actions.shape[1], Config(hidden_width=width)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
@@ -44,29 +46,29 @@ class Critic:
         self.std = torch.tensor(dataset.observations.std(0)) + 1e-3
 
     def twins(self, observations: Tensor, actions: Tensor, networks: Critics | None = None) -> Tensor:
-        """Both Q(s, a): (..., obs) and (..., act) to (2, ...)."""
+        """Both Q(s, a), (2, ...), for observations (..., obs) and actions (..., act)."""
         s, a = (self.observed(observations).flatten(0, -2), actions.flatten(0, -2))
         return (networks or self.critics)(s, a).unflatten(1, actions.shape[:-1])
 
     def q(self, observations: Tensor, actions: Tensor) -> Tensor:
-        """The smaller of both, (...)."""
+        """The smaller of both Q(s, a), (...)."""
         return self.twins(observations, actions).amin(0)
 
     def target_q(self, observations: Tensor, actions: Tensor) -> Tensor:
-        """The smaller of both copies, (...): what backups and V look at."""
+        """The smaller Q(s, a) of both target networks, (...). Backups and V use this value."""
         return self.twins(observations, actions, self.target_critics).amin(0)
 
     def v(self, observations: Tensor) -> Tensor:
-        """V(s): (B, obs) to (B,)."""
+        """V(s), (B,), for observations (B, obs)."""
         return self.value(self.observed(observations))
 
     def observed(self, observations: Tensor) -> Tensor:
-        """Standardised observations, in their shape."""
+        """The standardised observations, in the same shape."""
         return (observations - self.mean) / self.std
 
 
 class Course(NamedTuple):
-    """How a critic's values went: the mean Q(s, a) of recorded actions, `q` (k,), at `updates` (k,)."""
+    """A trained critic, and its mean Q(s, a) of recorded actions, `q` (k,), after `updates` (k,)."""
 
     updates: np.ndarray
     q: np.ndarray
@@ -83,11 +85,11 @@ def train_critic(
     learning_rate: float = 1e-3,
     tau: float = 0.2,
 ) -> Course:
-    """Trains Q towards r + gamma m next_value(critic, s', generator), and V to the kappa-expectile of Q.
+    """Train Q towards r + gamma m next_value(critic, s', generator), and V towards the kappa-expectile of Q.
 
-    m is 0 after terminals and, as in this project's default, after time limits. The copies follow 40 times
-    faster than IQL's (tau): what goes wrong goes wrong within a minute.
-    Batches of 256; the course is noted every 20 updates.
+    The mask m is 0 after terminals and, as by default in this project, after time limits. The Polyak step
+    `tau` of the target networks is 40 times IQL's, so that wrong values show within a minute. Batches have
+    256 transitions. The mean Q is recorded every 20 updates.
     """
     data, generator = dataset.tensors(), torch.Generator().manual_seed(seed)
     critic = Critic(dataset, scale=1 / (1 - gamma), seed=seed)
@@ -116,10 +118,12 @@ def train_critic(
     return Course(at, q, critic)
 
 
-def play_greedy(critic: Critic, task, gamma: float = 0.99, seed: int = 0, points: int = 21):
-    """One episode of the action that Q values highest, of a grid over [-1, 1]^2.
+def play_greedy(
+    critic: Critic, task: Task, gamma: float = 0.99, seed: int = 0, points: int = 21
+) -> tuple[float | None, float]:
+    """Play one episode with the action of highest Q among a grid of `points` values per component in [-1, 1].
 
-    Returns Q's claim at the first step and the discounted sum of the rewards that came of it.
+    Returns the highest Q at the first step, and the discounted sum of the rewards of the episode.
     """
     line = torch.linspace(-1, 1, points)
     grid = torch.cartesian_prod(*[line] * task.act_dim)
@@ -138,9 +142,13 @@ def play_greedy(critic: Critic, task, gamma: float = 0.99, seed: int = 0, points
     return claim, earned
 
 
-def latent_divergences(dataset: Dataset, updates: int = 400, width: int = 200, n: int = 2000, seed: int = 0):
-    """Would CPQ's VAE notice? The KL divergences (n,) that it gives recorded actions, and uniformly random
-    ones in the same states, after so many updates of its own loss at batch size 256.
+def latent_divergences(
+    dataset: Dataset, updates: int = 400, width: int = 200, n: int = 2000, seed: int = 0
+) -> tuple[np.ndarray, ...]:
+    """The KL divergences of CPQ's VAE for recorded actions, and for random actions in the same states.
+
+    Both are (n,). The random actions are uniform in [-1, 1]. The VAE has made `updates` with its own loss,
+    with batches of 256. The VAE can detect actions outside the data only if their divergences are larger.
     """
     data, generator = dataset.tensors(), torch.Generator().manual_seed(seed)
     s = (data.observations - data.observations.mean(0)) / (data.observations.std(0) + 1e-3)

@@ -1,4 +1,8 @@
-"""Datasets: arrays and batches (`dataset`), files (`hdf5`), where they are (`sources`), how ours are made."""
+"""Datasets.
+
+`dataset` holds the arrays and batches, `hdf5` reads and writes files, `sources` finds and downloads them. The
+other modules make the datasets that are shipped with the project.
+"""
 
 from tutorial_lib.data.dataset import KEYS, Batch, Dataset, DatasetError, returns_to_go, sample_batch
 from tutorial_lib.data.hdf5 import read_dataset, write_dataset

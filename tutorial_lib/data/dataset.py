@@ -1,28 +1,39 @@
 """Datasets as arrays, and batches to train on.
 
-A dataset is seven arrays with one row per transition, episode after episode (DSRL: Liu et al. 2024).
-`terminals` (the robot fell) and `timeouts` (the horizon was reached) both end an episode and are never
-merged: after a terminal nothing follows, whereas a time limit only ends the recording.
+A dataset is seven arrays with one row per transition, in the layout of DSRL (Liu et al. 2024). The rows of
+one episode stand together and in order. Both `terminals` (the robot fell) and `timeouts` (the horizon was
+reached) end an episode. They are never merged: after a terminal nothing follows, but a time limit only ends
+the recording.
 """
 
 import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from scipy.signal import lfilter  # the recursion y_t = x_t + gamma y_(t+1), compiled
+from numpy.typing import ArrayLike
+from scipy.signal import lfilter  # computes the recursion y_t = x_t + gamma y_(t+1) in compiled code
 
 KEYS = ("observations", "next_observations", "actions", "rewards", "costs", "terminals", "timeouts")
+"""The names of the seven arrays."""
 
 
 class DatasetError(ValueError):
-    """A dataset that cannot be used. One line: the file, the key, what is wrong, what to do."""
+    """Is raised for a dataset that cannot be used.
+
+    The message is one line: the file, the key, what is wrong, and what to do.
+    """
 
 
 class Batch(NamedTuple):
-    """B transitions as float32: observations (B, obs), actions (B, act), the others (B,), flags 0 or 1."""
+    """B transitions as float32 tensors.
+
+    observations and next_observations are (B, obs), actions (B, act), all others (B,). The flags terminals
+    and timeouts are 0 or 1.
+    """
 
     observations: torch.Tensor
     actions: torch.Tensor
@@ -37,9 +48,9 @@ class Batch(NamedTuple):
 class Dataset:
     """N transitions that make up whole episodes, in order.
 
-    observations, next_observations (N, obs), actions (N, act), rewards, costs (N,) are float32;
-    terminals, timeouts (N,) are bool. `attributes` tells where the data come from. The last row must
-    end an episode: DatasetError if not.
+    observations and next_observations (N, obs), actions (N, act), rewards and costs (N,) are float32.
+    terminals and timeouts (N,) are bool. `attributes` says where the data come from. Raises DatasetError
+    where the last row does not end an episode.
     """
 
     observations: np.ndarray
@@ -51,7 +62,7 @@ class Dataset:
     timeouts: np.ndarray
     attributes: dict = field(default_factory=dict)
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if not len(self) or not (self.terminals[-1] or self.timeouts[-1]):
             raise DatasetError("a dataset needs whole episodes: its last row must be a terminal or a timeout")
 
@@ -60,7 +71,7 @@ class Dataset:
 
     @cached_property
     def ends(self) -> np.ndarray:
-        """(num_episodes,): one past the last row of each episode, so that rows are [start, end)."""
+        """(num_episodes,): one past the last row of each episode. The rows of an episode are [start, end)."""
         return np.flatnonzero(self.terminals | self.timeouts) + 1
 
     @cached_property
@@ -70,65 +81,75 @@ class Dataset:
 
     @property
     def num_episodes(self) -> int:
+        """The number of episodes."""
         return len(self.ends)
 
     @property
     def episode_lengths(self) -> np.ndarray:
-        """(num_episodes,): steps."""
+        """(num_episodes,): the number of steps of each episode."""
         return self.ends - self.starts
 
     @cached_property
     def episode_returns(self) -> np.ndarray:
-        """(num_episodes,) float64: undiscounted sums of rewards."""
+        """(num_episodes,) float64: the undiscounted sum of the rewards of each episode."""
         return np.add.reduceat(self.rewards, self.starts, dtype=np.float64)
 
     @cached_property
     def episode_costs(self) -> np.ndarray:
-        """(num_episodes,) float64: undiscounted sums of costs, which a threshold bounds."""
+        """(num_episodes,) float64: the undiscounted sum of the costs of each episode. Limits apply to it."""
         return np.add.reduceat(self.costs, self.starts, dtype=np.float64)
 
     @cached_property
     def episode_index(self) -> np.ndarray:
-        """(N,): the episode of each row."""
+        """(N,): the number of each row's episode, counted from 0."""
         return np.repeat(np.arange(self.num_episodes), self.episode_lengths)
 
     @cached_property
     def checksum(self) -> str:
-        """SHA-256 of all values, in hexadecimal: the same for the same data, however a file packs them."""
+        """The SHA-256 of all values, in hexadecimal.
+
+        Equal data have equal checksums, whatever the compression of their files.
+        """
         digest = hashlib.sha256()
         for key in KEYS:
             digest.update(np.ascontiguousarray(getattr(self, key)).data)
         return digest.hexdigest()
 
-    def select(self, episodes) -> "Dataset":
-        """These episodes alone, a mask or indices in the order wanted: `d.select(d.episode_costs < 30)`."""
+    def select(self, episodes: np.ndarray | Sequence[int]) -> "Dataset":
+        """A dataset of some of the episodes, for example `d.select(d.episode_costs < 30)`.
+
+        `episodes` is a mask (num_episodes,), or the episodes' numbers in the wanted order. Raises
+        DatasetError where no episode is chosen.
+        """
         chosen = np.arange(self.num_episodes)[episodes]
         if not len(chosen):
-            raise DatasetError(f"select: none of {self.num_episodes} episodes chosen: a dataset needs one")
+            raise DatasetError(
+                f"select: none of {self.num_episodes} episodes is chosen: a dataset needs at least one"
+            )
         rows = np.concatenate([np.arange(self.starts[i], self.ends[i]) for i in chosen])
         return Dataset(**{key: getattr(self, key)[rows] for key in KEYS}, attributes=self.attributes)
 
-    def tensors(self, device="cpu") -> Batch:
-        """All N transitions as one Batch on `device`, a copy, so that training samples by indexing it."""
-        options = {"dtype": torch.float32, "device": device}
+    def tensors(self, device: torch.device | str = "cpu") -> Batch:
+        """A copy of all N transitions as one Batch on `device`. Training draws its batches from it."""
+        options: dict[str, Any] = {"dtype": torch.float32, "device": device}
         return Batch(**{key: torch.tensor(getattr(self, key), **options) for key in KEYS})
 
 
 def sample_batch(data: Batch, batch_size: int, generator: torch.Generator) -> Batch:
-    """`batch_size` rows of `data`, uniform, with replacement: observations (batch_size, obs) and so on.
+    """B = `batch_size` transitions of `data`, drawn uniformly with replacement.
 
-    The generator is on the CPU, so that the rows do not depend on the device of the data.
+    `generator` is on the CPU. So the drawn rows do not depend on the device of the data.
     """
     rows = torch.randint(len(data.rewards), (batch_size,), generator=generator)
     rows = rows.to(data.rewards.device, non_blocking=True)
     return Batch(*(values.index_select(0, rows) for values in data))
 
 
-def returns_to_go(dataset: Dataset, gamma: float, after_timeout=0.0) -> np.ndarray:
-    """Discounted sum of the rewards from each row to the end of its episode, (N,) float64.
+def returns_to_go(dataset: Dataset, gamma: float, after_timeout: ArrayLike = 0.0) -> np.ndarray:
+    """The discounted sum of the rewards from each row to the end of its episode, (N,) float64.
 
-    Nothing follows a terminal. What follows a time limit was not recorded: `after_timeout`, a number or one
-    per episode, is put in its place.
+    Nothing follows a terminal. What follows a time limit was not recorded: `after_timeout`, which is one
+    number or one per episode, (num_episodes,), is taken as the value of the state after it.
     """
     tails = np.broadcast_to(after_timeout, dataset.num_episodes)
     totals = np.empty(len(dataset))

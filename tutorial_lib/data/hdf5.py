@@ -1,4 +1,4 @@
-"""Files in DSRL's HDF5 layout: read, check and write them."""
+"""Reads, checks and writes files in DSRL's HDF5 layout."""
 
 import warnings
 from pathlib import Path
@@ -11,23 +11,22 @@ from tutorial_lib.files import written_whole
 from tutorial_lib.tasks import TASKS, Task, as_task
 
 FLAGS = ("terminals", "timeouts")
-
-
-# One column per chunk and shuffled bytes put like beside like, which is what gzip can use: 72% of the raw
-# size on CarCircle, against 75% with whole rows and 87% with whole rows and no shuffle.
 CHUNK_ROWS = 16384
-
-
 STORAGE = {"compression": "gzip", "compression_opts": 9, "shuffle": True}
+"""How arrays are stored. A chunk holds one column of `CHUNK_ROWS` rows, and its bytes are shuffled: similar
+bytes are then neighbours, which gzip compresses well. CarCircle's file has 72% of the raw size. It has 75%
+with chunks of whole rows, and 87% with whole rows and no shuffle."""
 
 
 def read_dataset(path: Path | str, task: Task | str) -> Dataset:
-    """Read and check a file in DSRL's layout. Columns may be (N, 1). Whatever it holds besides is ignored.
+    """The dataset in a file in DSRL's layout, after checks.
 
-    An unfinished tail belongs to no episode: it is dropped, with a warning that counts it. Raises
-    DatasetError for a file that is missing, empty, truncated, not HDF5 or another task's; for keys that are
-    missing or of the wrong shape for the task; for episodes longer than its horizon; for values that are
-    NaN or infinite, flags that are not 0 or 1, and negative costs; and where no episode ends.
+    Arrays of shape (N,) may be stored as (N, 1). Other keys of the file are ignored. Rows after the last end
+    of an episode are dropped, and a warning says how many they are.
+
+    Raises DatasetError for a file that is missing, empty, truncated, not HDF5, or of another task; for keys
+    that are missing or have the wrong shape for the task; for episodes longer than the task's horizon; for
+    values that are NaN or infinite, flags that are not 0 or 1, and negative costs; and where no episode ends.
     """
     path, task = Path(path), as_task(task)
     stored, attributes = _read_hdf5(path)
@@ -51,12 +50,15 @@ def read_dataset(path: Path | str, task: Task | str) -> Dataset:
     return dataset
 
 
-def write_dataset(path: Path | str, dataset: Dataset, task: Task | str, attributes=None) -> Path:
-    """Write `dataset` in DSRL's layout: five keys float32, flags bool, as `dsrl` 0.1.0 reads them.
+def write_dataset(
+    path: Path | str, dataset: Dataset, task: Task | str, attributes: dict | None = None
+) -> Path:
+    """Write `dataset` to a file in DSRL's layout, which `dsrl` 0.1.0 reads. Returns the path.
 
-    `attributes` (a dict of str, int, float) join the dataset's own on the file's root, with the task's name.
-    The file appears whole or not at all: a write that is killed leaves the old file as it was. Equal
-    datasets give equal bytes. Raises DatasetError where `read_dataset` would, before anything is written.
+    Five arrays are float32, the two flags are bool. The attributes of the file's root are the dataset's own,
+    `attributes` (values of type str, int or float), and the task's name. The file is written whole or not at
+    all: if the program is killed, the old file stays as it was. Equal datasets give equal bytes. Raises
+    DatasetError where `read_dataset` would, before anything is written.
     """
     path, task = Path(path), as_task(task)
     arrays = _check_arrays({key: getattr(dataset, key) for key in KEYS}, task, path)
@@ -70,7 +72,7 @@ def write_dataset(path: Path | str, dataset: Dataset, task: Task | str, attribut
 
 
 def _read_hdf5(path: Path) -> tuple[dict, dict]:
-    """The arrays under DSRL's keys, as many as the file has, and the attributes of its root."""
+    """The arrays that the file has under DSRL's keys, and the attributes of its root. Raises DatasetError."""
     again = "delete it, then fetch or collect it again"
     if not path.is_file():
         raise DatasetError(f"{path}: no such file: check the path")
@@ -92,8 +94,11 @@ def _read_hdf5(path: Path) -> tuple[dict, dict]:
 
 
 def _check_task(attributes: dict, task: Task, path: Path) -> None:
-    """DatasetError where the file is another task's by its attribute or, DSRL's having none, by its name."""
-    # BallRun and CarRun have the same shapes.
+    """Raises DatasetError where the attribute `task` or the file's name names another task.
+
+    DSRL's files have no such attribute, so that only the name can tell.
+    """
+    # The shapes cannot tell: BallRun and CarRun have the same.
     of_names = {other.dsrl_file: other.name for other in TASKS.values()}
     for what, made_for in (
         ("attribute task", str(attributes.get("task", task.name))),
@@ -104,7 +109,7 @@ def _check_task(attributes: dict, task: Task, path: Path) -> None:
 
 
 def _check_arrays(stored: dict, task: Task, path: Path) -> dict[str, np.ndarray]:
-    """The seven arrays with a Dataset's shapes and types, or a DatasetError that names the key."""
+    """The seven arrays with the shapes and types of a Dataset. Raises DatasetError, which names the key."""
     missing = [key for key in KEYS if key not in stored]
     if missing:
         raise DatasetError(f"{path}: {', '.join(missing)}: missing: DSRL's layout has {', '.join(KEYS)}")
@@ -126,9 +131,9 @@ def _check_arrays(stored: dict, task: Task, path: Path) -> dict[str, np.ndarray]
 
 
 def _check_values(values: np.ndarray, key: str, path: Path) -> np.ndarray:
-    """The values as bool where they are flags and as float32 elsewhere, or a DatasetError."""
+    """The values of one array, as bool for flags and as float32 for others. Raises DatasetError."""
 
-    def refuse(bad, what, remedy):
+    def refuse(bad: np.ndarray, what: str, remedy: str) -> None:
         rows = np.flatnonzero(bad.reshape(len(bad), -1).any(axis=1))
         if len(rows):
             count = f"{len(rows)} of {len(bad)} rows, the first is row {rows[0]}"
@@ -139,7 +144,7 @@ def _check_values(values: np.ndarray, key: str, path: Path) -> np.ndarray:
     if key in FLAGS:
         refuse((values != 0) & (values != 1), "neither 0 nor 1", "store False or True")
         return values.astype(bool)
-    with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite, and is refused
+    with np.errstate(over="ignore"):  # a value too large for float32 becomes infinite, and is refused below
         values = values.astype(np.float32, copy=False)
     refuse(~np.isfinite(values), "NaN or infinity", "leave those episodes out")
     if key == "costs":

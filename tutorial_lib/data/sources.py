@@ -1,4 +1,4 @@
-"""Where datasets are: shipped with the project, DSRL's own, or a path; and how DSRL's are fetched."""
+"""Finds datasets (shipped with the project, DSRL's own, or at a path), and downloads DSRL's."""
 
 import hashlib
 import os
@@ -11,21 +11,24 @@ from tutorial_lib.files import written_whole
 from tutorial_lib.tasks import TASKS, Task, as_task
 
 DSRL_URL = "https://huggingface.co/datasets/YYY-45/DSRL/resolve/main/"
-
-
 SHIPPED_DATA = Path(__file__).resolve().parents[2] / "data"
+"""The folder of the datasets, agents and results that are shipped with the project."""
 
 
 def load_dataset(task: Task | str, source: Path | str = "shipped") -> Dataset:
-    """Read a task's dataset from `source` (see `find_dataset`). Raises DatasetError."""
+    """The dataset of a task, read from `source` (see `find_dataset`).
+
+    Raises DatasetError where there is no file, or `read_dataset` refuses it.
+    """
     return read_dataset(find_dataset(task, source), task)
 
 
 def find_dataset(task: Task | str, source: Path | str = "shipped") -> Path:
-    """The file of a task: "shipped" with this project, "dsrl" for DSRL's own, or a path.
+    """The path of a task's dataset.
 
-    One source never stands in for another: what a name means must not depend on the machine that it is
-    said on, or results would not repeat. Raises DatasetError: where it looked, and what to run.
+    `source` is "shipped" for the file in this project, "dsrl" for DSRL's own file, or a path. Where the file
+    is missing, no other source is tried: otherwise the same command could use different data on two machines.
+    Raises DatasetError, which says where the file was expected and which command makes or downloads it.
     """
     task = as_task(task)
     fetch = f"`c2iql fetch {task.name}` downloads DSRL's"
@@ -44,27 +47,32 @@ def find_dataset(task: Task | str, source: Path | str = "shipped") -> Path:
 
 
 def shipped_tasks() -> list[str]:
-    """The tasks whose dataset is in `data/`."""
+    """The names of the tasks whose dataset is shipped with the project, in `data/`."""
     return [name for name in TASKS if (SHIPPED_DATA / f"{name}.hdf5").exists()]
 
 
 def dsrl_directory() -> Path:
-    """Where DSRL keeps its files: DSRL_DATASET_DIR, or ~/.dsrl/datasets."""
+    """The folder of DSRL's files: the environment variable DSRL_DATASET_DIR, or ~/.dsrl/datasets."""
     return Path(os.environ.get("DSRL_DATASET_DIR") or "~/.dsrl/datasets").expanduser()
 
 
 def fetch_dataset(task: Task | str, directory: Path | str | None = None, base_url: str = DSRL_URL) -> Path:
-    """Download DSRL's file of a task into `directory` (DSRL's own by default), unless it is there.
+    """Download DSRL's file of a task into `directory` if it is not there, and return its path.
 
-    DSRL publishes no checksums: the first fetch is trusted, and its SHA-256 is shown and remembered in
-    `<file>.sha256` (which `sha256sum -c` reads); a later fetch verifies the file. It appears in the
-    directory only when it is whole, as remembered, and readable as the task's. Raises DatasetError: no
-    network, no such file on the server, no space, or a file that differs or cannot be read.
+    The default of `directory` is DSRL's own folder.
+
+    DSRL publishes no checksums. So the first download is trusted: its SHA-256 is printed and stored in
+    `<file>.sha256`, which `sha256sum -c` reads. Every later call compares the file with the stored SHA-256. A
+    downloaded file gets its name only when it is complete, has the stored SHA-256, and can be read as the
+    task's dataset.
+
+    Raises DatasetError where there is no network, no such file on the server, or no space, and for a file
+    that has another SHA-256 or cannot be read.
     """
     task = as_task(task)
     path = Path(directory or dsrl_directory()).expanduser() / task.dsrl_file
     memory = path.with_name(f"{path.name}.sha256")
-    partial = path.with_name(f".{path.name}.partial")  # a folder: a killed fetch leaves no other trace
+    partial = path.with_name(f".{path.name}.partial")  # a folder: all that is left of a killed download
     try:
         if path.exists():
             digest = _verify(path, memory, task)
@@ -90,7 +98,7 @@ def fetch_dataset(task: Task | str, directory: Path | str | None = None, base_ur
 
 
 def _verify(file: Path, memory: Path, task: Task) -> str:
-    """The SHA-256 of a file that is as remembered, if it is remembered, and readable as the task's."""
+    """The SHA-256 of a file. Raises DatasetError where it is not the stored one or the data are unusable."""
     with open(file, "rb") as content:
         digest = hashlib.file_digest(content, "sha256").hexdigest()
     remembered = _remembered(memory) or digest
@@ -102,13 +110,16 @@ def _verify(file: Path, memory: Path, task: Task) -> str:
 
 
 def _remembered(memory: Path) -> str | None:
-    """The SHA-256 in a `.sha256` file; None where there is none, or a full disk cut it short."""
+    """The SHA-256 in a `.sha256` file. None where there is no file, or a full disk left it empty."""
     return next(iter(memory.read_text().split()), None) if memory.exists() else None
 
 
 def _download(base_url: str, name: str, folder: Path) -> Path:
-    """Download one file into `folder`. A connection that breaks is tried again, three times in all."""
-    import pooch  # progress bar, retries, and a file that bears its name only once it is complete
+    """Download one file into `folder`. A broken connection is tried again, up to three times in all.
+
+    Raises DatasetError.
+    """
+    import pooch  # for its progress bar and retries; a file has its name only when complete
     import requests
 
     shutil.rmtree(folder, ignore_errors=True)

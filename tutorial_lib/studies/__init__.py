@@ -1,1 +1,1 @@
-"""Grids of training runs: what to run, where it runs, and what the results say beside the paper's."""
+"""Studies: grids of training runs, how processes share them, and their results beside the paper's."""

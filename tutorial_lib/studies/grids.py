@@ -1,8 +1,10 @@
-"""Studies: grids of training runs as a table. `c2iql study NAME` runs one, on any number of cores.
+"""The table of all studies. A study is one or several grids of training runs.
 
-What one entry of a grid is stands in `runs`, how entries are spread over processes in `cluster`.
+`c2iql study NAME` runs a study on any number of cores. Module `runs` trains one entry of a grid, module
+`cluster` distributes the entries over processes.
 """
 
+import dataclasses
 import fnmatch
 import functools
 import itertools
@@ -21,28 +23,31 @@ from tutorial_lib.tasks import TASKS, get_task
 
 @dataclass(frozen=True)
 class Grid:
-    """All combinations of its tasks, algorithms and options; algorithms that are trained for one limit get
-    each."""
+    """One entry for every combination of task, algorithm and options.
+
+    An algorithm that is trained for one limit is trained for each threshold of the task.
+    """
 
     tasks: tuple[str, ...] = ("CarCircle",)
     algorithms: tuple[str, ...] = ("C2IQL",)
     options: tuple[dict, ...] = ({},)
-    """Changes to the profile, one agent each."""
+    """Changes of the profile's options. One agent is trained with each."""
     at_test: tuple[dict, ...] = ({},)
-    """Changes to the profile that only acting looks at: every agent plays under each."""
+    """Changes of options that only playing reads. Every agent plays its episodes once with each."""
     seeds: int = 3
+    """The number of seeds."""
     limits: tuple[float, ...] | None = None
-    """The limits that agents play under; None: the task's own."""
+    """The limits that agents play under. None: the task's thresholds."""
 
 
 @dataclass(frozen=True)
 class Study:
-    """A question, and the grids that answer it."""
+    """A question, and the grids whose results answer it."""
 
     question: str
     grids: tuple[Grid, ...]
     diagnoses: bool = False
-    """Do the results have what agents say of themselves, e.g. the error of a reconstruction model?"""
+    """Do the results have the columns of `Agent.diagnose`?"""
 
 
 KAPPAS = (0.5, 0.7, 0.9)
@@ -65,7 +70,7 @@ STUDIES: dict[str, Study] = {
         "Figures 3 and 7: what do cost reconstruction and constraint conditioning each add?",
         (
             Grid(("CarCircle", "BallCircle"), ABLATIONS),
-            Grid(("DroneCircle",), ABLATIONS, ({"cost_critics": 2},)),  # one critic is this task's own option
+            Grid(("DroneCircle",), ABLATIONS, ({"cost_critics": 2},)),  # the task's own option is one critic
         ),
     ),
     "kappas": Study(
@@ -121,20 +126,26 @@ STUDIES: dict[str, Study] = {
 
 
 def get_study(name: str) -> Study:
-    """The study called `name`, or ValueError that lists those there are."""
+    """The study called `name`. Raises ValueError, which lists the studies that exist."""
     if name not in STUDIES:
         raise ValueError(f"unknown study {name!r}: the studies are {', '.join(STUDIES)}")
     return STUDIES[name]
 
 
 def varied_options(study: Study) -> tuple[str, ...]:
-    """The options that differ between the cells of a grid: columns of the study's results."""
+    """The names of the options that differ between the entries of a grid. They are columns of the results."""
     varied = []
     for grid in study.grids:
         for changes in (grid.options, grid.at_test):
             names = (name for options in changes for name in options)
             varied += [name for name in names if len({options.get(name) for options in changes}) > 1]
     return tuple(dict.fromkeys(varied))
+
+
+def options_of(study: Study) -> list[str]:
+    """The names of all options that at least one algorithm of the study reads."""
+    kinds = [get_algorithm(name).Config for grid in study.grids for name in grid.algorithms]
+    return list(dict.fromkeys(field.name for kind in kinds for field in dataclasses.fields(kind)))
 
 
 def entries(
@@ -144,10 +155,11 @@ def entries(
     profile: str = "small",
     data: str = "shipped",
 ) -> list[Runs]:
-    """The study's entries whose name fits the pattern `only` (as of file names, anywhere in it).
+    """The study's entries. With `only`, those whose name has a part that fits this pattern of file names.
 
-    `change` is applied to every configuration last. Tasks without a dataset are left out. Raises DatasetError
-    where no task has one, ValueError where no name fits.
+    `change` is applied to every configuration, after the profile, the task's options and the grid's. `data`
+    says where datasets are, as for `find_dataset`. Tasks without a dataset are left out. Raises DatasetError
+    where no task has a dataset, and ValueError where no name fits.
     """
     columns, made, missing = varied_options(study), {}, None
     for grid in study.grids:
@@ -183,5 +195,5 @@ def entries(
 
 @functools.lru_cache
 def _checksum(task: str, path: Path, changed: int) -> str:
-    """Of a dataset, read once for as long as its file does not change."""
+    """The checksum of the dataset at `path`. It is computed again only when `changed`, a time, differs."""
     return load_dataset(task, path).checksum

@@ -1,9 +1,12 @@
-"""What the paper reports, for every place that shows it beside ours: always labelled, never a target.
+"""The results that the paper reports, for every table and figure that shows them beside ours.
 
-Its results are on DSRL's data, profile `paper`, five seeds; ours are on data of our own. Figures 3, 4 and 7
-are learning curves without printed values: what the text says of them is here as claims to be tested.
+They are always labelled as the paper's, and they are never a target. The paper's results are on DSRL's data,
+with the settings of profile `paper` and five seeds. Ours are on data of our own. Figures 3, 4 and 7 are
+learning curves without printed values: what the paper's text says about them stands here as claims that can
+be tested.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 COLUMNS = "AntRun BallRun CarRun DroneRun AntCircle BallCircle CarCircle DroneCircle".split()
@@ -35,7 +38,7 @@ TABLE1_AVERAGES = {
     "CDT": (0.71, 0.91),
     "C2IQL": (0.74, 0.76),
 }
-"""Its last column, as printed."""
+"""The last column of Table 1, as printed: the averages over the tasks."""
 
 TABLE1_STD = {
     "AntRun": (0.01, 0.05),
@@ -47,7 +50,10 @@ TABLE1_STD = {
     "CarCircle": (0.01, 0.07),
     "DroneCircle": (0.02, 0.11),
 }
-"""Its standard deviations of C2IQL's reward and cost. Of what is not said."""
+"""The standard deviations in Table 1, of C2IQL's normalised reward and cost.
+
+The paper does not say over what they are taken.
+"""
 
 TABLE2 = {
     "noise": (0.0, 0.1, 0.2, 0.3, 0.5, 1.0, 2.0, 4.0),
@@ -55,23 +61,30 @@ TABLE2 = {
     "return": (434.01, 435.07, 442.08, 435.67, 435.60, 421.82, 408.77, 401.89),
     "cost": (46.60, 47.20, 48.30, 47.30, 47.89, 42.10, 34.90, 36.20),
 }
-"""The paper's Table 2, on CarCircle at limit 50: no spread and no number of seeds are given."""
+"""The paper's Table 2, on CarCircle under the limit 50. The paper gives no spread and no number of seeds.
+
+The noise is a standard deviation in discounted cost. Return and cost are those of an episode, not
+normalised."""
 
 
 @dataclass(frozen=True)
 class Claim:
-    """The paper says that `score` is larger in the `high` rows of a study than in the `low` ones.
-
-    A number for `low` stands for itself. `where` restricts both to some rows.
-    """
+    """A statement of the paper: `score` is larger in some rows of a study's results than in others."""
 
     study: str
+    """The name of the study that tests it."""
     words: str
+    """The statement, for people."""
     source: str
+    """Where the paper says it: section, figure or table."""
     score: str
+    """The column to compare: 'reward_score' or 'cost_score'."""
     high: dict
+    """Values of columns. They select the rows where the score is larger."""
     low: dict | float
+    """The same for the rows where it is smaller, or a number to compare with."""
     where: dict = field(default_factory=dict)
+    """Values of columns that both have."""
 
 
 def _algorithm(name: str) -> dict:
@@ -82,14 +95,17 @@ def _noise(level: float) -> dict:
     return {"crm_noise": level}
 
 
-def _ablation(words: str, score: str, high: str, low: str, tasks=("CarCircle", "DroneCircle")) -> list[Claim]:
-    """Of Fig. 3 on CarCircle, of Fig. 7 on DroneCircle."""
+def _ablation(
+    words: str, score: str, high: str, low: str, tasks: Sequence[str] = ("CarCircle", "DroneCircle")
+) -> list[Claim]:
+    """One claim per task about two ablations, from Fig. 3 for CarCircle and from Fig. 7 for DroneCircle."""
     source = {"CarCircle": "4.2, Fig. 3", "DroneCircle": "B.3, Fig. 7"}
     sides = _algorithm(high), _algorithm(low)
     return [Claim("ablations", words, source[task], score, *sides, {"task": task}) for task in tasks]
 
 
-MIDDLE = {"threshold": 50}  # CarCircle's. One expectile varies, the other is Table 4's
+# CarCircle's middle threshold. Where one expectile varies, the other has the value of Table 4.
+MIDDLE = {"threshold": 50}
 REWARD, COST = "reward_score", "cost_score"
 CLAIMS = (
     *_ablation("C2IQL earns more than without cost reconstruction", REWARD, "C2IQL", "C2IQL w/o CR"),
@@ -165,4 +181,4 @@ CLAIMS = (
         if cost <= 1
     ),
 )
-"""What the paper's words say about its figures and tables, as comparisons that our results can test."""
+"""What the paper's text says about its figures and tables, as comparisons that our results can test."""

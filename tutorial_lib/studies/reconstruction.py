@@ -1,10 +1,10 @@
-"""How large must the reconstruction model be, and what noise should it train on? A CSV of measured errors.
+"""Measures how large the reconstruction model must be, and on what noise it should be trained.
 
 `python -m tutorial_lib.studies.reconstruction` makes data/results/reconstruction.csv in about half an hour.
 """
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -27,15 +27,19 @@ from tutorial_lib.tasks import Task, get_task
 
 PATH = SHIPPED_DATA / "results" / "reconstruction.csv"
 SIZES = {"linear": (0, 0), "1 x 16": (1, 16), "2 x 64": (2, 64), "3 x 128": (3, 128), "5 x 512": (5, 512)}
-"""Hidden layers and width. The last is the paper's, '2 x 64' is profile small's."""
+"""Hidden layers and their width. The paper has '5 x 512', profile `small` has '2 x 64'."""
 NOISES = TABLE2["noise"]
-"""Standard deviations of the noise on the inputs, in discounted cost."""
+"""Standard deviations of the noise on the inputs, in discounted cost (Table 2)."""
 STEPS = 2_000
-"""Iterations of Algorithm 1 for every size, at a batch of 256."""
+"""Iterations of Algorithm 1 for every size, with batches of 256."""
 
 
 def crm_config(size: str, noise: float, noise_rate: float = 0.0, steps: int = STEPS) -> ReconstructionConfig:
-    """The configuration of a model of this size, trained on this noise."""
+    """The options of a reconstruction model with a size and a training noise.
+
+    `size` is a key of `SIZES`, `steps` the number of iterations of Algorithm 1. `noise` is a standard
+    deviation in discounted cost, `noise_rate` in cost per step (option `crm_noise_rate`).
+    """
     layers, width = SIZES[size]
     return ReconstructionConfig.make("small").changed(
         crm="mlp" if layers else "linear",
@@ -55,9 +59,9 @@ def errors(
     n: int = 20_000,
     seed: int = 1,
 ) -> dict[str, float]:
-    """Root mean squared errors, in unsafe steps, where the inputs have the noise of `config`.
+    """Root mean squared errors of a model, in unsafe steps per episode, on inputs with the noise of `config`.
 
-    `random` is that on n random sequences which no training has seen; `episodes` that on the dataset's.
+    `random` is the error on n new random cost sequences, `episodes` the error on the dataset's episodes.
     """
     generator = torch.Generator().manual_seed(seed)
     std = input_noise(task, config)
@@ -74,7 +78,7 @@ def errors(
 
 
 def settings() -> Iterator[tuple[str, str, float, float, list[tuple[float, float]]]]:
-    """(task, size, training noise, its rate, [(test noise, its rate)]), small models first."""
+    """All settings: (task, size, training noise, its rate, [(test noise, its rate), ...])."""
     tests = [(0.0, 0.0), (0.1, 0.0), (0.0, 0.01)]
     for size in SIZES:
         for noise, rate in tests:
@@ -84,8 +88,16 @@ def settings() -> Iterator[tuple[str, str, float, float, list[tuple[float, float
                 yield "CarCircle", size, noise, 0.0, [(noise, 0.0)]
 
 
-def run(path: Path | None = PATH, chosen=None, steps: int = STEPS) -> pd.DataFrame:
-    """Train and test every setting (default: all); `path` gets the table as it grows, unless it is None."""
+def run(
+    path: Path | None = PATH,
+    chosen: Iterable[tuple[str, str, float, float, list[tuple[float, float]]]] | None = None,
+    steps: int = STEPS,
+) -> pd.DataFrame:
+    """Train and test the models of the chosen settings (default: all).
+
+    Returns one row per model and test noise. After every model the table is written to `path` as CSV, unless
+    `path` is None. Errors are in unsafe steps.
+    """
     rows = []
     for name, size, noise, rate, tests in chosen or settings():
         task, dataset = get_task(name), load_dataset(name)

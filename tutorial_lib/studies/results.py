@@ -1,7 +1,11 @@
-"""Results of studies, read from their files: per seed, with intervals over seeds, and against claims.
+"""Results of studies, read from their files: means per seed, intervals over seeds, and verdicts on claims.
 
-The unit is the seed. Ten episodes of one agent tell how that agent plays; only another training run tells
-what the algorithm does, and the episodes' own spread says nothing about it.
+The unit of observation is the seed. Ten episodes of one agent tell how that agent plays. How the algorithm
+performs can only be learned from more training runs, and the spread between episodes says nothing about it.
+
+Two scores are compared, as in DSRL: `reward_score` is the normalised return, `cost_score` the normalised cost
+C / L, which is at most 1 where the limit L is kept. `results` is always a table of raw results: one row per
+episode, with the columns `OWN_COLUMNS` and those of the options that the study varies.
 """
 
 from collections.abc import Sequence
@@ -9,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from numpy.typing import ArrayLike
 from scipy import stats
 
 from tutorial_lib.data.sources import SHIPPED_DATA
@@ -16,37 +21,39 @@ from tutorial_lib.scores import with_scores
 from tutorial_lib.studies.paper import Claim
 
 RESULTS = SHIPPED_DATA / "results"
+"""The folder of the shipped results."""
 SCORES = ("reward_score", "cost_score")
 OWN_COLUMNS = (
     "task algorithm profile seed threshold episode return cost length predicted_cost updates".split()
 )
+"""The columns that the results of every study have. The column `threshold` holds the limit of the episode."""
 
 
 def load_results(name: str, folder: Path = RESULTS) -> pd.DataFrame:
-    """The raw results of a study, or no rows where it was not run."""
+    """The raw results of a study. The table has no rows where the study was not run."""
     path = folder / f"{name}.csv"
     return pd.read_csv(path) if path.exists() else pd.DataFrame(columns=OWN_COLUMNS)
 
 
 def not_run(name: str) -> str:
-    """What stands where a study's numbers would."""
+    """The words that are shown instead of a study's numbers where it was not run."""
     return f"not run: `c2iql study {name}` makes it"
 
 
 def options_of(results: pd.DataFrame) -> list[str]:
-    """The columns of the options that a study varies."""
+    """The names of the columns that hold the options which a study varies."""
     return [name for name in results.columns if name not in (*OWN_COLUMNS, "reconstruction_error")]
 
 
 def seed_means(results: pd.DataFrame, by: Sequence[str] = ("task", "algorithm")) -> pd.DataFrame:
-    """One row per group and seed: both scores, averaged over episodes, then over limits (equal weights)."""
+    """One row per group of `by` and seed: both scores, averaged over episodes, then over limits."""
     keys = list(dict.fromkeys([*by, "seed", "threshold"]))
     means = with_scores(results).groupby(keys, sort=False, dropna=False)[list(SCORES)].mean().reset_index()
     return means.groupby([*by, "seed"], sort=False, dropna=False)[list(SCORES)].mean().reset_index()
 
 
-def seed_interval(values) -> tuple[float, float]:
-    """95% interval of a mean from one value per seed, by Student's t; NaN for a single seed."""
+def seed_interval(values: ArrayLike) -> tuple[float, float]:
+    """The 95% confidence interval of the mean of values (seeds,), by Student's t. (NaN, NaN) for one seed."""
     values = np.asarray(values, float)
     if len(values) < 2:
         return np.nan, np.nan
@@ -55,7 +62,11 @@ def seed_interval(values) -> tuple[float, float]:
 
 
 def over_seeds(results: pd.DataFrame, by: Sequence[str] = ("task", "algorithm")) -> pd.DataFrame:
-    """One row per group: mean, standard deviation and 95% interval over seeds of both scores."""
+    """One row per group of `by`: mean, standard deviation and 95% interval over seeds of both scores.
+
+    The columns of a score are its name, and its name with `_std`, `_low` and `_high`. `seeds` is their
+    number.
+    """
     rows = []
     for key, part in seed_means(results, by).groupby(list(by), sort=False, dropna=False):
         row = dict(zip(by, key, strict=True)) | {"seeds": len(part)}
@@ -70,10 +81,13 @@ def over_seeds(results: pd.DataFrame, by: Sequence[str] = ("task", "algorithm"))
 
 
 def difference(results: pd.DataFrame, score: str, high: dict, low: dict | float) -> np.ndarray:
-    """The score in the rows `high` minus that in the rows `low`, one value for each seed that has both.
+    """The score in the rows `high` minus the score in the rows `low`: one value for each seed that has both.
 
-    Runs of one seed share their episodes' starts, and their batches where they draw the same random numbers
-    (conditioned ones also draw limits), so they are paired.
+    `high` and `low` map columns to the values that select the rows. Where `low` is a number, this number is
+    subtracted.
+
+    The differences are paired: runs of one seed begin their episodes in the same states, and they train on
+    the same batches if they draw the same random numbers. (Conditioned agents also draw limits.)
     """
 
     def of(rows: dict | float, like: pd.Series | None = None) -> pd.Series:
@@ -89,15 +103,16 @@ def difference(results: pd.DataFrame, score: str, high: dict, low: dict | float)
 
 
 def verdicts(claims: Sequence[Claim], results: pd.DataFrame) -> pd.DataFrame:
-    """One row per claim and task: the difference, its interval over seeds, and what it says of the claim.
+    """One row per claim and task: the difference, its 95% interval over seeds, and the verdict on the claim.
 
-    'agrees' and 'contradicts' need an interval on one side of zero; a single seed has none.
+    The verdict is 'agrees' where the whole interval is above zero, 'contradicts' where it is below, and
+    'undecided' otherwise. A single seed has no interval.
     """
     rows = []
     for claim in claims:
         chosen = results
         for key, value in claim.where.items():
-            chosen = chosen[chosen[key] == value] if key in chosen else chosen[:0]  # not run
+            chosen = chosen[chosen[key] == value] if key in chosen else chosen[:0]  # no column: not run
         for task in chosen["task"].unique() if len(chosen) else ["-"]:
             part = chosen[chosen["task"] == task]
             values = difference(part, claim.score, claim.high, claim.low) if len(part) else np.array([])
@@ -106,6 +121,7 @@ def verdicts(claims: Sequence[Claim], results: pd.DataFrame) -> pd.DataFrame:
 
 
 def _judge(values: np.ndarray) -> dict:
+    """The mean of one claim's differences (seeds,), its interval, and the verdict, as words by column."""
     if not len(values):
         return {"difference": "", "95% over seeds": "", "ours": "not run"}
     low, high = seed_interval(values)
@@ -115,9 +131,11 @@ def _judge(values: np.ndarray) -> dict:
 
 
 def against(results: pd.DataFrame, base: dict) -> pd.DataFrame:
-    """One row per task and variant other than `base`: what it changes, with intervals over seeds (paired).
+    """One row per task and variant: its differences from the variant `base`, with 95% intervals over seeds.
 
-    A gain is a difference whose interval lies above zero, a loss one below; else it is undecided.
+    A variant is a combination of the values of the columns that `base` names. The differences are paired by
+    seed. Their verdict is 'higher' where the whole interval is above zero, 'lower' where it is below, and
+    'undecided' otherwise.
     """
     names, rows = list(base), []
     for key, part in results.groupby(["task", *names], sort=False, dropna=False):
@@ -136,7 +154,11 @@ def against(results: pd.DataFrame, base: dict) -> pd.DataFrame:
 
 
 def kept(results: pd.DataFrame) -> pd.DataFrame:
-    """By task and algorithm: mean normalised cost; shares of (seed, limit) and of episodes that keep it."""
+    """One row per task and algorithm: the mean normalised cost, and how often the limit was kept.
+
+    'agents and limits kept' is the share of pairs (seed, limit) whose mean cost over episodes is at most the
+    limit. 'episodes kept' is the share of single episodes.
+    """
     scores, by = with_scores(results), ["task", "algorithm"]
     agents = scores.groupby([*by, "seed", "threshold"], sort=False)["cost_score"].mean().le(1)
     episodes = scores.assign(kept=scores["cost_score"].le(1)).groupby(by, sort=False)["kept"].mean()

@@ -1,9 +1,9 @@
-"""One entry of a study: a training run for each seed (and limit), all trained together, and the episodes they
-play.
+"""One entry of a study: runs of one algorithm that are trained together, and the episodes that they play.
 
-Its name ends in a hash of its options, seeds and data, so a finished entry is a file of that name, and a
-changed option or dataset makes another entry. The code is not in the hash: whoever changes an algorithm
-begins with another folder of runs.
+There is one run for each seed, or for each seed and limit. The name of an entry ends in a hash of its
+options, seeds and data. A finished entry has a file of results with this name, and a changed option or
+dataset makes a new entry. The code is not part of the hash: after a change of an algorithm, use a new folder
+of runs.
 """
 
 import dataclasses
@@ -31,46 +31,48 @@ from tutorial_lib.tasks import get_task
 
 @dataclass(frozen=True)
 class Runs:
-    """Training runs of one algorithm that differ in seed and limit, and their episodes."""
+    """An entry: training runs of one algorithm that differ in seed and limit, and their episodes."""
 
     task: str
     algorithm: str
     config: Config
     seeds: tuple[int, ...]
     trained_for: tuple[float, ...] | None
-    """The limits of an algorithm that is trained for one: every seed is trained for each."""
+    """For an algorithm that is trained for one limit: the limits. Every seed is trained for each of them."""
     limits: tuple[float, ...] | None
-    """The limits of the episodes; None: the task's own."""
+    """The limits that the episodes are played under. None: the task's thresholds."""
     at_test: tuple[dict, ...]
-    """Changes to options that only playing reads: every agent plays under each."""
+    """Changes of options that only playing reads. Every agent plays its episodes once with each."""
     label: str
-    """What distinguishes these runs from the others of the study, for people."""
+    """Words for what distinguishes these runs from the others of the study."""
     columns: tuple[str, ...]
-    """The options that the study varies."""
+    """The names of the options that the study varies."""
     diagnoses: bool
-    """Do the results have the agent's own `diagnose`?"""
+    """Do the results have the columns of `Agent.diagnose`?"""
     checksum: str
-    """The dataset's."""
+    """The checksum of the dataset."""
     data: str = "shipped"
+    """Where the dataset is, as for `find_dataset`."""
     episodes: int = 10
+    """The number of episodes per run and limit."""
 
     @property
     def name(self) -> str:
-        """What it is, for people, and a hash of its options, seeds and data."""
+        """The entry's name: its task, algorithm and label, and a hash of its options, seeds and data."""
         words = "-".join(
             part.replace(" ", "-") for part in (self.task, slug(self.algorithm), self.label) if part
         )
         everything = dataclasses.asdict(self)
-        del everything["data"]  # a path: what it holds is in the checksum
+        del everything["data"]  # a path: the checksum stands for the data themselves
         return f"{words}-{hashlib.sha256(json.dumps(everything).encode()).hexdigest()[:8]}"
 
     @property
     def pairs(self) -> list[tuple[int, float | None]]:
-        """The seed and the limit of each run."""
+        """The seed and the limit of each run. The limit is None where the algorithm is trained for none."""
         return [(seed, limit) for limit in self.trained_for or (None,) for seed in self.seeds]
 
     def build(self) -> Agent:
-        """The agent, untrained."""
+        """A new agent with these runs, not yet trained."""
         seeds, limits = zip(*self.pairs, strict=True)
         kind = get_algorithm(self.algorithm)
         return kind(
@@ -79,16 +81,16 @@ class Runs:
 
 
 def train_and_play(runs: Runs, folder: Path, tell: Callable[[int], object] = lambda updates: None) -> Path:
-    """Train (or continue, or take an equal agent that is there), play, write `folder`/NAME.csv. Returns its
-    path.
+    """Train an entry, play its episodes, and write the results to `folder`/NAME.csv. Returns this path.
 
-    `tell` is called now and then with the number of updates made. Raises ValueError where the dataset is
-    another than the study's.
+    A finished entry is left as it is, an interrupted training is continued, and an equal trained agent that
+    exists is used. `tell` is called at every checkpoint with the number of updates so far. Raises ValueError
+    where the dataset is not the study's.
     """
     path = results_path(runs, folder)
     if path.exists():
         return path
-    torch.set_num_threads(1)  # a study runs several of these side by side
+    torch.set_num_threads(1)  # several entries run at once, each on its own core
     dataset = load_dataset(runs.task, runs.data)
     if dataset.checksum != runs.checksum:
         raise ValueError(f"{runs.name}: the dataset here has another checksum than the study's")
@@ -110,16 +112,22 @@ def train_and_play(runs: Runs, folder: Path, tell: Callable[[int], object] = lam
 
 
 def results_path(runs: Runs, folder: Path) -> Path:
-    """The file that finished runs have."""
+    """The file of a finished entry's results."""
     return folder / f"{runs.name}.csv"
 
 
 def play(runs: Runs, agent: Agent, dataset: Dataset) -> pd.DataFrame:
-    """Raw results: the columns of `evaluate`, the options that the study varies, and diagnoses if it asks."""
+    """The raw results of an entry's episodes: one row per run, limit, element of `at_test` and episode.
+
+    The columns are those of `evaluate`, the options that the study varies, and the diagnoses if it asks for
+    them.
+    """
     frames = []
     for changes in runs.at_test:
         player = agent.playing_with(**changes)
         results = evaluate(player, runs.limits, runs.episodes, seeds=runs.seeds)
+        if runs.trained_for:  # an agent that was found may have been trained for more limits
+            results = results[results["threshold"].isin(runs.trained_for)]
         columns = {name: getattr(player.config, name) for name in runs.columns}
         columns |= player.diagnose(dataset) if runs.diagnoses else {}
         frames.append(results.assign(**columns))
@@ -127,7 +135,10 @@ def play(runs: Runs, agent: Agent, dataset: Dataset) -> pd.DataFrame:
 
 
 def find_trained(runs: Runs, folder: Path) -> Agent | None:
-    """An agent of equal runs, these or more, shipped or of any study beside `folder`."""
+    """A trained agent with the same options and data that has at least these runs, or None.
+
+    It is looked for among the shipped agents and in the folders of all studies beside `folder`.
+    """
     places = [*(SHIPPED_DATA / "agents").glob("*.safetensors"), *folder.parent.glob("*/*/agent.safetensors")]
     for path in sorted(places):
         if _has_equal_runs(path, runs):
@@ -138,6 +149,7 @@ def find_trained(runs: Runs, folder: Path) -> Agent | None:
 
 
 def _has_equal_runs(path: Path, runs: Runs) -> bool:
+    """Does this file hold an agent with the same task, algorithm, data and options, and all of these runs?"""
     kind = get_algorithm(runs.algorithm)
     try:
         with safe_open(path, "pt") as file:
@@ -151,24 +163,25 @@ def _has_equal_runs(path: Path, runs: Runs) -> bool:
         config = kind.Config(**header["config"])
         pairs = list(zip(header["seeds"], header["limits"] or [None] * len(header["seeds"]), strict=True))
     except (OSError, SafetensorError, KeyError, TypeError, ValueError):
-        return False  # of another version, or being written
+        return False  # written by another version, or not yet complete
     same = {name: getattr(runs.config, name) for name in kind.at_test}
     return config.changed(**same) == runs.config and set(runs.pairs) <= set(pairs)
 
 
 def _read(value: str) -> Any:
+    """The value of one field of an agent's file: JSON, or the text itself."""
     try:
         return json.loads(value)
-    except json.JSONDecodeError:  # a name
+    except json.JSONDecodeError:  # names are not written as JSON
         return value
 
 
 def collect(chosen: Sequence[Runs], folder: Path, path: Path, keep: bool = False) -> int:
-    """Stack the results that are finished in `folder` into one CSV. Returns how many of `chosen` are
-    finished.
+    """Write the results of the finished entries in `folder` into one CSV, `path`.
 
-    `keep` the rows that the CSV already has of other runs: a clone has the results, but not the runs. Raises
-    ValueError where these rows are of a study with other options.
+    Returns the number of finished entries. With `keep`, the CSV's rows of other entries stay: a clone of the
+    project has the results but not the runs. Raises ValueError where these rows are of a study with other
+    options.
     """
     done = [results_path(runs, folder) for runs in chosen if results_path(runs, folder).exists()]
     if not done:
@@ -185,7 +198,7 @@ def collect(chosen: Sequence[Runs], folder: Path, path: Path, keep: bool = False
         results = pd.concat([before[~again], results], ignore_index=True)
         place = {(runs.task, runs.algorithm): i for i, runs in reversed(list(enumerate(chosen)))}
         of_rows = zip(results["task"], results["algorithm"], strict=True)
-        rows = [place.get(pair, len(chosen)) for pair in of_rows]  # tasks that the grid lost come last
+        rows = [place.get(pair, len(chosen)) for pair in of_rows]  # tasks outside the grid come last
         results = results.iloc[np.argsort(rows, kind="stable")]
     save_results(results, path)
     return len(done)

@@ -1,7 +1,8 @@
-"""Constrained Markov decision processes small enough to solve exactly: the ground truth of the course.
+"""Constrained Markov decision processes (CMDPs) that are small enough to be solved exactly.
 
-S states, A actions, float64 throughout. A policy is an (S, A) array of probabilities. Values and limits here
-are discounted sums (eq. 2) unless a horizon is given; then they are the plain sums of eq. 1.
+They give the course its true values. There are S states and A actions, and all numbers are float64. A policy
+is an (S, A) array of probabilities. Values and limits are discounted sums (eq. 2), except in functions with a
+horizon: there they are the undiscounted sums of eq. 1.
 """
 
 from tutorial_lib.course.tabular.budgets import *

@@ -1,4 +1,4 @@
-"""Budgets on the shortcut: laps, policies for a rate of cost, and what a policy that sees the budget pays."""
+"""The repeated shortcut, and policies on it that depend on the cost spent so far."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -11,7 +11,7 @@ from tutorial_lib.course.tabular.optimal import solve
 
 
 def laps(slip: float = 0.1, gamma: float = 0.99) -> CMDP:
-    """The shortcut again and again: from the goal, which pays 1, the next step leads back to the start."""
+    """The repeated shortcut: the goal pays a reward of 1, and the next step leads back to the start."""
     once = shortcut(slip, gamma)
     goal = "".join(SHORTCUT).index("G")
     transitions = once.transitions.copy()
@@ -20,41 +20,43 @@ def laps(slip: float = 0.1, gamma: float = 0.99) -> CMDP:
 
 
 def rate_policy(cmdp: CMDP, limit: float, horizon: int) -> np.ndarray:
-    """The best policy, (S, A), whose cost falls at the rate of `limit` per `horizon` steps.
+    """The best policy, (S, A), whose cost per step is at most `limit` / `horizon`.
 
-    Eq. 2 over an endless episode: its limit is the rate over 1 - gamma. Raises ValueError where no policy
-    is that cheap.
+    It solves eq. 2 for an endless episode, with the limit (limit / horizon) / (1 - gamma) on the discounted
+    cost. Raises ValueError where every policy costs more.
     """
     return solve(cmdp, limit / horizon / (1 - cmdp.gamma)).policy
 
 
 class Spending(NamedTuple):
-    """What a policy earns in `horizon` steps, and the chances of what it has spent."""
+    """The expected return of a policy in T steps, and the distribution of its cost. Both are undiscounted."""
 
     reward: float
-    """expected sum of rewards"""
+    """The expected sum of rewards."""
     chances: np.ndarray
-    """(T+1, T+1): the probability that c is spent before step t"""
+    """(T+1, T+1): in row t and column c, the probability that the cost before step t is c."""
 
     @property
     def cost(self) -> float:
-        """Expected sum of costs."""
+        """The expected sum of costs."""
         return float(self.chances[-1] @ np.arange(len(self.chances)))
 
     def exceeds(self, limit: float) -> float:
-        """Share of episodes that cost more than `limit`."""
+        """The probability that an episode costs more than `limit`."""
         return float(self.chances[-1, np.arange(len(self.chances)) > limit].sum())
 
 
 def follow(cmdp: CMDP, horizon: int, policy: Callable[[int], np.ndarray]) -> Spending:
-    """Exactly, without simulation: `policy(t)` gives (T+1, S, A), the policy after each sum c already spent.
+    """What a policy that depends on the spent cost earns and spends in T = `horizon` steps.
 
-    Costs must be 0 or 1, as in all of the course's tasks: else ValueError.
+    The result is exact, without simulation. `policy(t)` returns (T+1, S, A): the policy at step t after each
+    cost c = 0, ..., T spent so far. Raises ValueError for costs that are not 0 or 1. (In all of the course's
+    tasks they are.)
     """
     if not np.isin(cmdp.costs, (0, 1)).all():
         raise ValueError("costs must be 0 or 1")
     states = len(cmdp.initial)
-    here = np.zeros((horizon + 1, states))  # P(spent c, in state s)
+    here = np.zeros((horizon + 1, states))  # the probability of having spent c and being in state s
     here[0] = cmdp.initial
     chances, reward = [here.sum(1)], 0.0
     for t in range(horizon):

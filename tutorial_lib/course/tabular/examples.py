@@ -1,4 +1,6 @@
-"""The shortcut, the course's running example, and random CMDPs."""
+"""The shortcut, which is the course's running example, and random CMDPs."""
+
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -6,17 +8,19 @@ from tutorial_lib.course.tabular.cmdp import CMDP
 
 ARROWS = ("↑", "→", "↓", "←")
 _MOVES = ((-1, 0), (0, 1), (1, 0), (0, -1))
-# S start, G goal, h hazard. Three ways lead to the goal: straight through the hazards (4 steps, 3 of them
-# hazardous), over the middle row (6 steps, 1 hazardous), and around (8 steps, none).
+# S is the start, G the goal, h a hazard. Three paths lead to the goal: straight through the hazards (4 steps,
+# 3 of them hazardous), over the middle row (6 steps, 1 of them hazardous), and around (8 steps, none of
+# them).
 SHORTCUT = ("     ", "  h  ", "ShhhG")
 
 
-def shortcut(slip: float = 0.1, gamma: float = 0.9, layout=SHORTCUT) -> CMDP:
-    """The course's running example: a grid where the short way is hazardous. S = cells, A = 4 (`ARROWS`).
+def shortcut(slip: float = 0.1, gamma: float = 0.9, layout: Sequence[str] = SHORTCUT) -> CMDP:
+    """The course's running example: a grid in which the short path leads through hazards.
 
-    A step taken on a hazard costs 1, a step taken on the goal earns 1, and the goal is never left. With
-    probability `slip` a move goes in a random one of the four directions, and one off the grid stays put.
-    State row * columns + column is the cell (row, column) of `layout`.
+    The states are the cells of `layout`: state row * columns + column is the cell (row, column). The four
+    actions are moves in the directions `ARROWS`. An action on a hazard costs 1, an action on the goal earns
+    1, and the goal is never left. With probability `slip` the direction of a move is replaced by a random one
+    of the four. A move that would leave the grid leaves the state unchanged.
     """
     rows, columns = len(layout), len(layout[0])
     cells = np.array([list(row) for row in layout]).ravel()
@@ -37,7 +41,7 @@ def shortcut(slip: float = 0.1, gamma: float = 0.9, layout=SHORTCUT) -> CMDP:
 def random_cmdp(
     rng: np.random.Generator, states: int = 6, actions: int = 3, gamma: float = 0.9, branching: int = 3
 ) -> CMDP:
-    """A random one: every action leads to `branching` states, rewards are uniform on (0, 1), costs 0 or 1."""
+    """A random CMDP: actions lead to `branching` states, rewards are uniform in (0, 1), costs are 0 or 1."""
     transitions = np.zeros((states, actions, states))
     for row in transitions.reshape(-1, states):
         row[rng.permutation(states)[:branching]] = rng.dirichlet(np.ones(branching))

@@ -1,4 +1,4 @@
-"""The best policy under a limit: in expectation by linear programmes, in every episode by recursion."""
+"""Optimal policies under a limit on the expected cost, or on the cost of every episode."""
 
 import dataclasses
 from typing import NamedTuple
@@ -10,35 +10,39 @@ from tutorial_lib.course.tabular.cmdp import CMDP, Episodes, draw
 
 
 class Solution(NamedTuple):
-    """An optimal policy, (S, A), with what it earns and costs, and the price of its limit.
-
-    `price` is the limit's Lagrange multiplier: what one more unit of limit would earn. `occupancy` is the
-    policy's own, (S, A). With a horizon both are (T, S, A). Where the policy never comes, it is uniform.
-    """
+    """An optimal policy under a limit, with its values. With a horizon T, (S, A) is (T, S, A)."""
 
     policy: np.ndarray
+    """(S, A). It is uniform in states that it never visits."""
     reward: float
+    """The expected sum of rewards."""
     cost: float
+    """The expected sum of costs."""
     price: float
+    """The Lagrange multiplier of the limit: the reward that one more unit of limit would add."""
     occupancy: np.ndarray
+    """The occupancy of the policy, (S, A)."""
 
 
 def solve(cmdp: CMDP, limit: float = np.inf) -> Solution:
-    """Eq. 2 exactly, as a linear programme over occupancies (Altman 1999).
+    """The solution of eq. 2, by a linear programme over occupancies (Altman 1999).
 
-    Raises ValueError, which names the least achievable cost, if no policy keeps the limit.
+    `limit` is the limit on the discounted cost. Raises ValueError, which says the least achievable cost, if
+    no policy keeps the limit.
     """
     return _solve(cmdp.transitions, cmdp.rewards, cmdp.costs, cmdp.initial, cmdp.gamma, limit)
 
 
 def least_cost(cmdp: CMDP) -> float:
-    """The least discounted cost that any policy achieves: a limit below it is infeasible."""
+    """The least discounted cost of all policies. No policy keeps a smaller limit."""
     return solve(dataclasses.replace(cmdp, rewards=-cmdp.costs)).cost
 
 
 def solve_episodes(cmdp: CMDP, horizon: int, limit: float = np.inf) -> Solution:
-    """Eq. 1 exactly: the best expected sum of rewards of `horizon` steps, undiscounted, under a limit on the
-    expected sum of costs. The policy, (horizon, S, A), depends on the step. Raises ValueError as `solve`.
+    """The solution of eq. 1: the largest expected return of T = `horizon` steps under a limit.
+
+    The limit is on the expected cost. Both sums are undiscounted. The policy, (T, S, A), depends on the step.
+    Raises ValueError, which says the least achievable cost, if no policy keeps the limit.
     """
     states, actions = cmdp.rewards.shape
     steps = np.zeros((horizon, states, actions, horizon, states))
@@ -52,10 +56,18 @@ def solve_episodes(cmdp: CMDP, horizon: int, limit: float = np.inf) -> Solution:
     return found._replace(policy=found.policy.reshape(shape), occupancy=found.occupancy.reshape(shape))
 
 
-def _solve(transitions, rewards, costs, initial, gamma, limit) -> Solution:
+def _solve(
+    transitions: np.ndarray,
+    rewards: np.ndarray,
+    costs: np.ndarray,
+    initial: np.ndarray,
+    gamma: float,
+    limit: float,
+) -> Solution:
+    """The linear programme of `solve`, for the arrays of a CMDP. Here gamma may be 1."""
     states, actions = rewards.shape
-    leaving = np.repeat(np.eye(states), actions, axis=0)  # (S A, S): a visit of (s, a) leaves s ...
-    flow = (leaving - gamma * transitions.reshape(-1, states)).T  # ... and comes discounted to the next state
+    leaving = np.repeat(np.eye(states), actions, axis=0)  # (S A, S): a visit of (s, a) leaves s,
+    flow = (leaving - gamma * transitions.reshape(-1, states)).T  # and enters the next state, discounted
     limited = {"A_ub": costs.reshape(1, -1), "b_ub": [limit]} if np.isfinite(limit) else {}
     found = linprog(-rewards.ravel(), **limited, A_eq=flow, b_eq=initial, method="highs")
     if found.status == 2:
@@ -71,14 +83,17 @@ def _solve(transitions, rewards, costs, initial, gamma, limit) -> Solution:
     return Solution(policy, float((rewards * visits).sum()), float((costs * visits).sum()), price, visits)
 
 
-def budget_optimum(cmdp: CMDP, horizon: int, budget: int, stopped: float = 0.0):
-    """The best that keeps a budget in *every* episode: exact, by recursion over (steps, budget, state).
+def budget_optimum(
+    cmdp: CMDP, horizon: int, budget: int, stopped: float = 0.0
+) -> tuple[np.ndarray, np.ndarray]:
+    """The optimal values and actions if *every* episode must keep a budget.
 
-    Undiscounted, as eq. 1, with costs that are whole numbers. Returns values (T+1, budget+1, S), the expected
-    reward from step t on with b left to spend, and the actions taken, (T, budget+1, S) int. An action that
-    costs more than b is not to be had. Where none is, the episode is stopped: the value is `stopped` and the
-    action -1. With `stopped=-inf` that must never happen, and -inf marks what no policy can keep for certain.
-    Raises ValueError for costs that are not whole or negative.
+    They are found by recursion over step, budget and state. Sums are undiscounted (eq. 1), and costs are
+    whole numbers. The values, (T+1, budget+1, S), are the expected sums of rewards from step t on, with b of
+    the budget left. The actions are (T, budget+1, S) int. An action that costs more than b is not allowed.
+    Where no action is allowed, the episode is stopped: the value is `stopped` and the action is -1. With
+    `stopped=-inf` stopping is forbidden, and the value is -inf where no policy is certain to keep the budget.
+    Raises ValueError for costs that are negative or not whole.
     """
     if (cmdp.costs < 0).any() or (cmdp.costs % 1).any():
         raise ValueError("a budget is counted in whole costs: they must be 0, 1, 2, ...")
@@ -99,7 +114,10 @@ def budget_optimum(cmdp: CMDP, horizon: int, budget: int, stopped: float = 0.0):
 
 
 def play_budget(cmdp: CMDP, policy: np.ndarray, n: int, rng: np.random.Generator) -> Episodes:
-    """Play n episodes of `budget_optimum`'s policy, from its full budget. A stopped one earns and costs 0."""
+    """Simulate n episodes of the actions of `budget_optimum`, (T, budget+1, S), from the full budget.
+
+    After an episode is stopped, its rewards and costs are 0.
+    """
     horizon, levels, _ = policy.shape
     states, actions = np.zeros((2, n, horizon), int)
     rewards, costs = np.zeros((2, n, horizon))
