@@ -20,7 +20,7 @@ project = "Safe offline reinforcement learning with C2IQL"
 html_title = project
 copyright = "2026, the C2IQL tutorial authors"
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.mathjax", "sphinx-mathjax-offline"]
-exclude_patterns = ["tutorial_lib"]
+exclude_patterns = ["tutorial_lib", "benchmarks"]
 
 nb_execution_mode = "off"  # the Makefile has executed the notebooks
 nb_output_stderr = "remove"

@@ -662,6 +662,16 @@ def test_ppo_and_its_schedule_are_saved_and_loaded_whole(kind, tmp_path):
     assert scales == [1 / 3 if kind == "lagrangian" else 0]
 
 
+def test_the_seed_and_the_kind_seed_the_environments():
+    """Runs in progress depend on these numbers."""
+    for place, kind in enumerate(("priced", "lagrangian")):
+        model, _ = make_ppo(BALL, RECIPE, kind, 3, [])
+        ours, expected = model.env.get_attr("rng"), np.random.default_rng([3, place]).spawn(16)
+        assert [rng.bit_generator.state for rng in ours] == [rng.bit_generator.state for rng in expected]
+        assert model.seed == 3
+        model.env.close()
+
+
 def test_target_kl_stops_the_epochs_early():
     """PPO goes over a batch ten times, here in four parts; a policy that may not move is stopped at once."""
 

@@ -4,10 +4,17 @@ nbval passes over a cell without an execution count even where it is marked, and
 raises-exception that raises nothing: both are ruled out here.
 """
 
+import dataclasses
+import re
 from pathlib import Path
+from pkgutil import resolve_name
 
 import nbformat
+import pandas as pd
 import pytest
+
+from tutorial_lib.agents import ALGORITHMS
+from tutorial_lib.studies import report, results
 
 NOTEBOOKS = sorted(Path(__file__).parents[1].glob("notebooks/[0-9]*.ipynb"))
 
@@ -62,3 +69,54 @@ def test_is_short(notebook):
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_is_small(path):
     assert path.stat().st_size < 500_000
+
+
+def _read(start):
+    (path,) = (path for path in NOTEBOOKS if path.name.startswith(start))
+    return nbformat.read(path, as_version=4)
+
+
+def test_links_to_files_lead_somewhere(notebook):
+    text = "\n".join(cell.source for cell in notebook.cells if cell.cell_type == "markdown")
+    for address in re.findall(r"\]\(([^)#:]+)[^):]*\)", text):
+        assert (NOTEBOOKS[0].parent / address).is_file(), address
+
+
+def test_the_symbols_are_names_of_the_library():
+    """Every name in the second column of notebook 00's table of symbols exists where the table says."""
+    table = _read("00").cells[-1].source
+    names = re.findall(
+        r"`([a-z_]+(?:\.\w+)+)`", "".join(line for line in table.splitlines() if line[:1] == "|")
+    )
+    assert len(names) > 20
+    for name in names:
+        owner, last = resolve_name(f"tutorial_lib.{name}".rpartition(".")[0]), name.rpartition(".")[2]
+        fields = dataclasses.fields(owner) if dataclasses.is_dataclass(owner) else ()
+        assert hasattr(owner, last) or last in [field.name for field in fields], name
+
+
+def test_the_results_show_a_new_algorithm(monkeypatch):
+    """Notebook 10 as it is shows an algorithm that is added to the registry, run or not."""
+    rows = results.load_results("table1")
+    both = pd.concat([rows, rows[rows["algorithm"] == "BC-All"].assign(algorithm="Run")])
+    monkeypatch.setattr(results, "load_results", lambda name: both)
+    monkeypatch.setattr(report, "load_results", lambda name: both)
+    monkeypatch.setitem(ALGORITHMS, "Later", type("Later", (ALGORITHMS["BC-All"],), {"name": "Later"}))
+    names, tables, pictures = {}, [], []
+    for cell in _code(_read("10")):
+        if "import" in cell.source:
+            exec(cell.source, names)
+        elif cell.source.startswith(("Markdown(report.baselines_table", "Markdown(report.markdown(kept(")):
+            tables.append(eval(cell.source, names).data)
+        elif cell.source.startswith("figures.per_limit("):
+            pictures.append(eval(cell.source, names))
+    (baselines, kept), (picture,) = tables, pictures
+    (legend,) = picture.legends
+    assert "| Run |" in baselines and "| Run |" in kept
+    assert "Later" in next(line for line in baselines.splitlines() if "| - |" in line)
+    assert "Run" in [text.get_text() for text in legend.get_texts()]
+
+
+def test_the_code_of_the_results_names_no_algorithm_but_c2iql():
+    code = "\n".join(cell.source for cell in _code(_read("10")))
+    assert set(re.findall("|".join(f'"{re.escape(name)}"' for name in ALGORITHMS), code)) == {'"C2IQL"'}

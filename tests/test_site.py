@@ -10,6 +10,10 @@ from urllib.parse import unquote
 import nbformat
 import pytest
 
+from tutorial_lib.agents import ALGORITHMS, slug
+from tutorial_lib.options import describe
+from tutorial_lib.studies.results import load_results
+
 ROOT = Path(__file__).parents[1]
 NOTEBOOKS = sorted(ROOT.glob("notebooks/[0-9]*.ipynb"))
 
@@ -19,7 +23,8 @@ def site(tmp_path_factory):
     """Built as `make course` does, of the notebooks with their stored outputs."""
     pages, built = (tmp_path_factory.mktemp(name) for name in ("pages", "site"))
     shutil.copytree(ROOT / "notebooks", pages / "notebooks", ignore=shutil.ignore_patterns(".*"))
-    (pages / "tutorial_lib").symlink_to(ROOT / "tutorial_lib")
+    for folder in ("tutorial_lib", "benchmarks"):
+        (pages / folder).symlink_to(ROOT / folder)
     (pages / "data").mkdir()
     for path in (ROOT / "data").iterdir():
         if path.name != "README.md":
@@ -58,3 +63,38 @@ def test_the_reference_has_a_line_on_every_module(site):
     page = (site / "reference.html").read_text()
     modules = [path for path in ROOT.glob("tutorial_lib/**/*.py") if path.name != "__main__.py"]
     assert page.split("<table")[1].count("<tr") == len(modules)  # a head, and the package itself is no row
+
+
+def test_the_list_of_algorithms_has_a_line_on_each(site):
+    page = (site / "algorithms.html").read_text()
+    assert page.split("<table")[1].count("<tr") == 1 + len(ALGORITHMS)  # the first is the head
+    for name in ALGORITHMS:
+        assert f'href="algorithms/{slug(name)}.html">{name}</a>' in page
+
+
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_an_algorithm_has_a_page(site, name):
+    """The page shows every option, every logged scalar, and the algorithm's row of Table 1."""
+    kind, results = ALGORITHMS[name], load_results("table1")
+    page = (site / "algorithms" / f"{slug(name)}.html").read_text()
+    assert f"<h1>{name}<" in page
+    options, scalars = section(page, "Options"), section(page, "What it logs")
+    assert first_cells(options)[: len(describe(kind.Config)) - 1] == [
+        option for option in describe(kind.Config) if option != "profile"
+    ]
+    assert first_cells(scalars) == list(kind.scalars)
+    tasks = list(results.loc[results["algorithm"] == name, "task"].unique())
+    assert first_cells(section(page, "Results")) == tasks
+    assert bool(tasks) == kind.in_table1
+
+
+def section(page: str, title: str) -> str:
+    """The HTML from one heading of second order to the next."""
+    return page.split(f"<h2>{title}<")[1].split("<h2>")[0]
+
+
+def first_cells(html: str) -> list[str]:
+    """The text of the first cell of each row of all tables, without their heads."""
+    bodies = "".join(re.findall(r"<tbody>(.*?)</tbody>", html, re.DOTALL))
+    cells = re.findall(r"<tr[^>]*>\s*<td>(.*?)</td>", bodies, re.DOTALL)
+    return [re.sub(r"<[^>]+>", "", cell).strip() for cell in cells]

@@ -67,7 +67,7 @@ def train(
 
 @dataclass
 class _Record:
-    """What is kept of a training: its log, and its checkpoints if it has a folder."""
+    """Keeps the log of a training, and writes its checkpoints if it has a folder."""
 
     agent: Agent
     generators: list[torch.Generator]
@@ -78,7 +78,7 @@ class _Record:
     on_checkpoint: Callable[[Agent], object] | None
 
     def start_clock(self) -> None:
-        """The log's updates per second count from here."""
+        """Starts the clock for the log's updates per second."""
         self.started, self.first_update = time.perf_counter(), self.agent.updates
 
     def after_update(self, scalars: dict[str, torch.Tensor], last: bool) -> bool:

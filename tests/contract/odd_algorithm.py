@@ -42,7 +42,7 @@ class Actor(nn.Module):
         self.kinds = nn.Embedding(KINDS, WIDTH)
         self.spread = nn.Linear(1, WIDTH, bias=False)
         self.norm = nn.LayerNorm(WIDTH)
-        self.attention = nn.MultiheadAttention(WIDTH, 2, batch_first=True)
+        self.attention = nn.MultiheadAttention(WIDTH, 2, bias=False, batch_first=True)
         self.head = Output(WIDTH, task.act_dim)
 
     def forward(self, observations, kinds, mask=1.0):

@@ -1,20 +1,14 @@
-"""What every algorithm promises: gradients, runs together and alone, files, acting, options, documentation.
+"""What every algorithm promises: gradients, runs together and alone, files, acting, randomness, devices.
 
 The tests run for all of `ALGORITHMS`, for the template that newcomers copy, and for an odd algorithm that
 uses everything that the interface allows. `pytest tests/contract -k NAME` runs them for one.
 """
 
-import ast
 import contextlib
 import dataclasses
-import importlib.util
-import inspect
 import json
 import math
 import pickle
-import sys
-from pathlib import Path
-from typing import Annotated, Literal, get_args, get_origin, get_type_hints
 
 import numpy as np
 import pytest
@@ -23,94 +17,13 @@ from plain import Plain
 from randoms import ACT, OBS, of_run, randomise
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
+from toys import DATA, TEMPLATE, UPDATES, T, every_algorithm, make_agent, registered, runs_of, start
 
-from tutorial_lib.agents import ALGORITHMS, Agent, slug
 from tutorial_lib.checkpoints import TrainingError, load_agent, save_agent
-from tutorial_lib.config import PROFILES, Bound
-from tutorial_lib.data.dataset import Dataset
-from tutorial_lib.tasks import TASKS
 from tutorial_lib.training import train
 
-
-def loaded(name) -> type[Agent]:
-    """The algorithm in a file of this folder, loaded by its path as a module of its own."""
-    spec = importlib.util.spec_from_file_location(name, Path(__file__).with_name(f"{name}.py"))
-    module = sys.modules[name] = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    kinds = [kind for kind in vars(module).values() if isinstance(kind, type) and kind.__module__ == name]
-    return next(kind for kind in kinds if issubclass(kind, Agent))
-
-
-ODD, TEMPLATE = loaded("odd_algorithm"), loaded("template_algorithm")
-KINDS = ALGORITHMS | {kind.name: kind for kind in (ODD, TEMPLATE)}
-every_algorithm = pytest.mark.parametrize("kind", KINDS.values(), ids=map(slug, KINDS))
-
-T, UPDATES = 10, 12
-TASK = dataclasses.replace(
-    TASKS["BallRun"], name="Toy", horizon=T, obs_dim=OBS, act_dim=ACT, gammas=(0.6, 0.8, 0.9),
-    thresholds=(1, 3, 6), cost_range=8, min_return=-5.0, max_return=40.0,
-)  # fmt: skip
-TINY = {  # of these options, each algorithm takes those that it has
-    "updates": UPDATES,
-    "batch_size": 16,
-    "hidden_width": 8,
-    "hidden_layers": 1,
-    "crm_width": 8,
-    "crm_layers": 1,
-    "crm_steps": 20,
-}
 QUIET = {"log_every": 1, "progress": False}
-
-
-@pytest.fixture(autouse=True)
-def registered(monkeypatch):
-    """The toy task and the two algorithms of this folder are found by their names."""
-    monkeypatch.setitem(TASKS, TASK.name, TASK)
-    for kind in (ODD, TEMPLATE):
-        monkeypatch.setitem(ALGORITHMS, kind.name, kind)
-
-
-def make_dataset(episodes=60) -> Dataset:
-    """Random transitions in episodes of 4 to 10 steps, which cost from nothing to all of their steps."""
-    rng = np.random.default_rng(0)
-    lengths = rng.integers(4, T + 1, episodes)
-    ends, rows = np.cumsum(lengths), lengths.sum()
-    last = np.isin(np.arange(1, rows + 1), ends)
-    fell = last & np.repeat(lengths < T, lengths)
-    rates = np.repeat(np.linspace(0, 1, episodes), lengths)
-    return Dataset(
-        observations=rng.normal(3, 2, size=(rows, OBS)).astype(np.float32),
-        next_observations=rng.normal(3, 2, size=(rows, OBS)).astype(np.float32),
-        actions=rng.uniform(-1, 1, size=(rows, ACT)).astype(np.float32),
-        rewards=rng.normal(2, 4, size=rows).astype(np.float32),
-        costs=(rng.random(rows) < rates).astype(np.float32),
-        terminals=fell,
-        timeouts=last & ~fell,
-    )
-
-
-DATA = make_dataset()
-
-
-def runs_of(kind):
-    """Three runs, as pairs of seed and limit: they differ in seed, or in limit if they have one."""
-    return ((0, 6.0), (0, 0.0), (7, 0.0)) if kind.needs_limit else ((0, None), (3, None), (7, None))
-
-
-def make_agent(kind, runs=None, device="cpu", **changes):
-    seeds, limits = zip(*(runs or runs_of(kind)), strict=True)
-    names = [field.name for field in dataclasses.fields(kind.Config)]
-    tiny = {name: value for name, value in TINY.items() if name in names}
-    config = kind.configure("small", TASK, **tiny | changes)
-    return kind(TASK, config, seeds, limits if kind.needs_limit else None, device)
-
-
-def start(agent):
-    """The agent as it is before its first update: with the data and the generator of each run."""
-    parts = [agent.select(DATA, limit) for limit in agent.limits or [math.inf] * len(agent.seeds)]
-    agent.prepare(parts, progress=False)
-    generators = [torch.Generator().manual_seed(seed) for seed in agent.seeds]
-    return [part.tensors(agent.device) for part in parts], generators
+__all__ = ["registered"]  # a fixture for every test here
 
 
 def without_speed(log):
@@ -122,7 +35,7 @@ def assert_states_close(agent, run, other):
     state = agent.state()
     for key, value in other.items():
         if key.startswith(("online.", "target.", "buffer.", "variable.")):
-            torch.testing.assert_close(state[key][run], value, rtol=1e-3, atol=1e-4, msg=key)
+            torch.testing.assert_close(state[key][run], value, rtol=1e-3, atol=5e-5, msg=key)
 
 
 # --- Gradients ---
@@ -454,120 +367,3 @@ def test_in_bfloat16_an_update_is_about_the_same_and_leaves_float32(kind, runs):
 def test_acting_does_not_round(kind):
     agents = [make_agent(kind, precision=precision) for precision in ("float32", "bfloat16")]
     assert np.array_equal(*(agent.act(*some_episodes()) for agent in agents))
-
-
-# --- Limits and options ---
-
-
-@every_algorithm
-def test_a_limit_is_given_where_it_is_needed_and_nowhere_else(kind):
-    config = make_agent(kind).config
-    right, wrong = (3.0, None) if kind.needs_limit else (None, 3.0)
-    assert kind(TASK, config, seeds=(1, 2), limits=right).limits == (right and (right, right))
-    with pytest.raises(ValueError, match=kind.name):
-        kind(TASK, config, limits=wrong)
-    for seeds in ((), (-1,), (4, 4)):
-        with pytest.raises(ValueError, match="seeds"):
-            kind(TASK, config, seeds=seeds, limits=right)
-    if kind.needs_limit:
-        assert kind(TASK, config, seeds=(4, 4), limits=(1.0, 2.0)).limits == (1.0, 2.0)
-        for bad in (-1.0, math.nan, (3.0, -1.0), (3.0,)):
-            with pytest.raises(ValueError, match="limit"):
-                kind(TASK, config, seeds=(1, 2), limits=bad)
-
-
-@every_algorithm
-def test_both_profiles_and_every_tasks_own_options_make_a_config(kind):
-    for profile in PROFILES:
-        for task in (None, *TASKS.values()):
-            config = kind.configure(profile, task)
-            assert type(config) is kind.Config and config.profile == profile
-    names = {field.name for field in dataclasses.fields(kind.Config)}
-    assert kind.Config.tasks.keys() <= TASKS.keys()
-    assert all(changes.keys() <= names for changes in kind.Config.tasks.values())
-    assert set(kind.at_test) <= names
-
-
-@every_algorithm
-def test_an_option_that_it_does_not_read_is_an_error(kind):
-    names = {field.name for field in dataclasses.fields(kind.Config)}
-    others = {
-        field.name: field.default for other in KINDS.values() for field in dataclasses.fields(other.Config)
-    }
-    for name, value in (others | {"colour": 1}).items():
-        if name not in names:
-            with pytest.raises(ValueError, match=name):
-                kind.configure(**{name: value})
-    other = next(one.Config for one in KINDS.values() if one.Config is not kind.Config)
-    with pytest.raises(ValueError, match=f"{kind.name} takes a {kind.Config.__name__}"):
-        kind(TASK, other(), limits=3.0 if kind.needs_limit else None)
-
-
-def parts_of(hint):
-    """The types that a field takes, its bounds, and the words of a Literal."""
-    bounds = []
-    if get_origin(hint) is Annotated:
-        hint, *rest = get_args(hint)
-        bounds = [part for part in rest if isinstance(part, Bound)]
-    if get_origin(hint) is Literal:
-        return (), bounds, get_args(hint)
-    return get_args(hint) or (hint,), bounds, ()
-
-
-@every_algorithm
-def test_every_option_has_a_bound_or_words_and_refuses_everything_else(kind):
-    hints = get_type_hints(kind.Config, include_extras=True)
-    for field in dataclasses.fields(kind.Config):
-        types, bounds, words = parts_of(hints[field.name])
-        wrong = [object(), ["a list"]]
-        if int in types or float in types:
-            assert bounds, f"{field.name} has no bound"
-            out = [x for x in (-1, 0, 1, 2) if not all(bound.holds(x) for bound in bounds)]
-            assert out, f"the bound of {field.name} bounds nothing"
-            wrong += ["1", True, *(float(x) if int not in types else x for x in out)]
-            wrong += [math.nan] if float in types else [1.5]
-        else:
-            assert words or types in ((bool,), (str,)), (
-                f"{field.name} is neither a number, nor words, nor bool"
-            )
-            wrong += ["no such word"] * bool(words) + [1] * (bool in types)
-        for value in wrong:
-            with pytest.raises(ValueError, match=f"^{field.name} is .*and must be"):
-                kind.configure().changed(**{field.name: value})
-
-
-# --- Documentation ---
-
-
-def documented(kind):
-    """The fields of a config that a string follows in the source, with that string, as editors read them."""
-    words = {}
-    for owner in kind.Config.__mro__[:-1]:
-        (body,) = [node.body for node in ast.parse(inspect.getsource(owner)).body]
-        for field, following in zip(body, [*body[1:], None], strict=True):
-            if isinstance(field, ast.AnnAssign) and isinstance(following, ast.Expr):
-                words.setdefault(field.target.id, following.value.value)
-    return words
-
-
-@every_algorithm
-def test_every_option_and_every_scalar_is_explained_in_a_sentence(kind):
-    words = documented(kind)
-    for field in dataclasses.fields(kind.Config):
-        text = words.get(field.name, "")
-        assert len(text.split()) > 2 and text.rstrip().endswith((".", "?")), f"{field.name}: {text!r}"
-    agent = make_agent(kind)
-    data, generators = start(agent)
-    assert agent.update(agent.draw_all(data, generators)).keys() == kind.scalars.keys()
-    assert all(kind.scalars.values())
-
-
-@every_algorithm
-def test_its_file_begins_with_its_sources_and_numbers_its_departures(kind):
-    documentation = sys.modules[kind.__module__].__doc__
-    paragraphs = documentation.split("\n\n")
-    (sources,) = [i for i, text in enumerate(paragraphs) if text.startswith("Sources")]
-    assert sources <= 2, "what it is, and then the sources"
-    departures = [i for i, text in enumerate(paragraphs) if text.startswith("Departures")]
-    assert all(i > sources for i in departures) and len(departures) <= 1
-    assert (kind.__doc__ or "").strip(), "the class says in a sentence what it is"

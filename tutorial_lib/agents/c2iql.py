@@ -142,11 +142,9 @@ class C2IQL(ConstrainedAgent):
     def draw(self, data: Batch, generator: torch.Generator, limit: float) -> dict[str, Tensor]:
         """Returns a batch of transitions, and thresholds (B,) as its `limit` (lines 4 and 5)."""
         batch = super().draw(data, generator, limit)
-        return (
-            batch | {"limit": draw_thresholds(self.task, self.config, generator)}
-            if self.conditioned
-            else batch
-        )
+        if not self.conditioned:
+            return batch
+        return batch | {"limit": draw_thresholds(self.task, self.config, generator)}
 
     def network_input(self, net: Networks, observations: Tensor, limit: Tensor) -> Tensor:
         """Returns normalised observations with the encoded limit as one more input, (..., obs + 1)."""
@@ -209,13 +207,9 @@ class C2IQL(ConstrainedAgent):
         weight = losses.expectile_weight(q - v, config.kappa_2)
         policy_loss = losses.policy_loss(weight, gaussian_log_prob(a, *net.policy(s)))
 
-        return {
-            "value": value_loss,
-            "cost_value": cost_value_loss,
-            "critic": critic_loss,
-            "cost_critic": cost_critic_loss,
-            "policy": policy_loss,
-        }, {
+        of_networks = {"value": value_loss, "cost_value": cost_value_loss, "critic": critic_loss}
+        of_networks |= {"cost_critic": cost_critic_loss, "policy": policy_loss}
+        return of_networks, {
             "safe_fraction": (cost <= limit).float().mean(),
             "cost_mean": cost.mean(),
             "value_mean": v.mean(),

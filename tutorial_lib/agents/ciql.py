@@ -79,13 +79,9 @@ class CIQL(ConstrainedAgent):
         weight = losses.expectile_weight(q - v, config.kappa_2)
         policy_loss = losses.policy_loss(weight, gaussian_log_prob(a, *net.policy(s)))
 
-        return {
-            "value": value_loss,
-            "cost_value": cost_value_loss,
-            "critic": critic_loss,
-            "cost_critic": cost_critic_loss,
-            "policy": policy_loss,
-        }, {
+        of_networks = {"value": value_loss, "cost_value": cost_value_loss, "critic": critic_loss}
+        of_networks |= {"cost_critic": cost_critic_loss, "policy": policy_loss}
+        return of_networks, {
             "safe_fraction": (cost <= limit).float().mean(),
             "value_mean": v.mean(),
             "negative_q": (q_reward < 0).float().mean(),

@@ -107,6 +107,26 @@ def input_noise(task: Task, config: ReconstructionConfig) -> Tensor:
     return (config.crm_noise**2 + rate**2).sqrt()
 
 
+def _whiten(model: CostReconstruction, x: Tensor, share: Tensor, noise_std: Tensor) -> None:
+    """Sets the mean and the whitening matrix of inputs x (n, m) with weights `share` (n,) and this noise."""
+    model.mean.copy_(share @ x)
+    centred = x - share @ x
+    covariance = centred.mT @ (share[:, None] * centred) + torch.diag(noise_std.square())
+    model.whiten.copy_(torch.linalg.inv(torch.linalg.cholesky(covariance)).mT)
+
+
+def _solve(model: CostReconstruction, x: Tensor, y: Tensor, share: Tensor) -> None:
+    """Sets a linear model's weights to the least-squares solution for inputs x (n, m) and sums y (n,).
+
+    With whitened inputs, least squares is a mean, and the noise in the covariance is a ridge penalty.
+    """
+    with torch.no_grad():
+        white = (x - share @ x) @ model.whiten.to(x)
+        weight, bias = model.net.parameters()
+        weight.copy_((share * (y - share @ y) / model.horizon) @ white)
+        bias.copy_(share @ y / model.horizon)
+
+
 def train_reconstruction(
     task: Task,
     config: ReconstructionConfig,
@@ -131,18 +151,10 @@ def train_reconstruction(
     )
     half = [torch.full((len(part),), 0.5 / len(part), dtype=torch.float64) for _, part in sums]
     share = torch.cat(half).to(device)  # the weights of episodes and of random sequences sum to 1/2 each
-    model.mean.copy_(share @ x)
-    centred = x - share @ x
     noise_std = input_noise(task, config).to(x)
-    covariance = centred.mT @ (share[:, None] * centred) + torch.diag(noise_std.square())
-    model.whiten.copy_(torch.linalg.inv(torch.linalg.cholesky(covariance)).mT)
+    _whiten(model, x, share, noise_std)
     if config.crm == "linear":
-        # With whitened inputs, least squares is a mean, and the noise in the covariance is a ridge penalty.
-        with torch.no_grad():
-            white = centred @ model.whiten.to(x)
-            weight, bias = model.net.parameters()
-            weight.copy_((share * (y - share @ y) / task.horizon) @ white)
-            bias.copy_(share @ y / task.horizon)
+        _solve(model, x, y, share)
         return model.requires_grad_(False)
 
     x, y, boundary = x.float(), y.float(), len(sums[0][1])

@@ -1,4 +1,4 @@
-"""Datasets.
+"""Datasets: their arrays and batches, their files, where they are found, and how ours are made.
 
 `dataset` holds the arrays and batches, `hdf5` reads and writes files, `sources` finds and downloads them. The
 other modules make the datasets that are shipped with the project.

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from tutorial_lib.agents import ALGORITHMS
 from tutorial_lib.agents.c2iql import C2IQLConfig
 from tutorial_lib.costs.conditioning import threshold_set
 from tutorial_lib.data.recordings import best_left
@@ -91,7 +92,8 @@ def baselines_table() -> str:
         return f"*{not_run('table1').capitalize()}.*"
     found = over_seeds(results).set_index(["algorithm", "task"])
     run = found.index.get_level_values(0).unique()
-    missing = [name for name in ("BC-All", "BC-Safe", *TABLE1) if name not in run]
+    ours = [name for name, kind in ALGORITHMS.items() if kind.in_table1]
+    missing = [name for name in dict.fromkeys((*ours, *TABLE1)) if name not in run]
     rows, tasks = [], [task for task in TASKS if task in TABLE1["C2IQL"]]
     for name in run:
         row = {"": name, "seeds": found.loc[name, "seeds"].min()}
