@@ -37,7 +37,7 @@ export IPYTHONDIR := $(CURDIR)/build/ipython
 # The site is built beside links to what the notebooks' own links lead to; what is a page of it is copied.
 course: $(READY) $(EXECUTED)
 	@rm -rf build/site $(filter-out $(EXECUTED),$(wildcard build/pages/notebooks/*))
-	@rm -rf build/pages/data && mkdir build/pages/data && ln -sfn ../../tutorial_lib build/pages
+	@rm -rf build/pages/data && mkdir build/pages/data && ln -sfn ../../tutorial_lib ../../benchmarks build/pages
 	@ln -s $(patsubst %,../../../%,$(filter-out data/README.md,$(wildcard data/*))) build/pages/data
 	@cp data/README.md build/pages/data && cp site/*.md build/pages
 	@$(BIN) -m sphinx -q -W --keep-going -c site build/pages build/site
@@ -46,12 +46,12 @@ course: $(READY) $(EXECUTED)
 # Beside links to what the notebooks' own links lead to, as the site.
 slides: $(READY) $(EXECUTED)
 	@rm -rf build/slides $(filter-out $(EXECUTED),$(wildcard build/pages/notebooks/*)) && mkdir -p build/slides
-	@ln -sfn ../data ../tutorial_lib build
+	@ln -sfn ../data ../tutorial_lib ../benchmarks build
 	@$(BIN) site/slides.py build/pages/notebooks build/slides
 	@echo "The slides lie at $(CURDIR)/build/slides/index.html: open it in a browser."
 
 student: $(READY)
-	@rm -rf build/student && mkdir -p build && ln -sfn ../data ../tutorial_lib build
+	@rm -rf build/student && mkdir -p build && ln -sfn ../data ../tutorial_lib ../benchmarks build
 	@$(BIN) site/student.py notebooks build/student
 	@echo "The notebooks without solutions lie in $(CURDIR)/build/student."
 

@@ -318,3 +318,9 @@ def test_room_left_shows_the_best_recorded_episode_within_each_limit():
     task = TASKS["BallRun"]
     expected = [(r - task.min_return) / (task.max_return - task.min_return) for r in best]
     assert lines_of(figure.axes[0])["best recorded"].get_ydata() == pytest.approx(expected)
+
+
+def test_twelve_algorithms_look_different_and_none_is_left_out():
+    names = [f"algorithm {i}" for i in range(12)]
+    looks = figures.algorithm_looks(pd.DataFrame({"algorithm": names}))
+    assert list(looks) == names and len({(look["color"], look["marker"]) for look in looks.values()}) == 12

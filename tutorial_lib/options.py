@@ -61,6 +61,8 @@ def parse_training(words: Sequence[str]) -> tuple[type[Agent], Training]:
         f"Train {kind.name} and save it with its log.\n\n{(kind.__doc__ or '').strip()}\n\n"
         f"Other algorithms: c2iql train ALGORITHM --help, with one of {', '.join(map(slug, ALGORITHMS))}."
     )
+    if {"-h", "--help"} & set(words):
+        words = ["--help"]  # after a task, tyro's help would leave out TASK
     args: Any = tyro.cli(options, args=words, prog=f"c2iql train {slug(kind.name)}")
     if task is None:  # the defaults would lack the task's own options
         raise ValueError("write the task before the options: c2iql train [ALGORITHM] TASK [options]")

@@ -15,7 +15,7 @@ Departures:
 
 The paper leaves points 2 to 4 open. The text of each option says what is known of it.
 
-Measured: the page "Results" has the tables and figures, from `data/results/table1.csv` and `ablations.csv`.
+Measured: `data/results/table1.csv` and `data/results/ablations.csv`; their tables stand in `data/README.md`.
 In profile `small`, some tasks have other options, for these reasons:
 
 - DroneRun: with `time_limits='rate'`, agents stayed near the many episodes that never exceed the speed limit.

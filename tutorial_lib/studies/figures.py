@@ -180,8 +180,12 @@ def _interval_and_dots(ax, x, dots, colour, label):
 
 def algorithm_looks(results) -> dict[str, dict]:
     """How each algorithm is drawn, by its place in the results: the same in every figure made of them."""
-    looks = zip(results["algorithm"].unique(), VARIANTS, MARKS, strict=False)
-    return {name: {"color": colour, "marker": mark, "markersize": 8} for name, colour, mark in looks}
+    looks = {}
+    for place, name in enumerate(results["algorithm"].unique()):
+        again = place // len(VARIANTS)  # colours repeat with another mark
+        colour, mark = VARIANTS[place % len(VARIANTS)], MARKS[(place + again) % len(MARKS)]
+        looks[name] = {"color": colour, "marker": mark, "markersize": 8}
+    return looks
 
 
 @one_figure

@@ -40,7 +40,8 @@ def two_maxima(seed: int = 0, arms: int = 20, degree: int = 2):
 
 @one_figure
 def courses(panels: dict):
-    """How values went, a panel each: {title: ({label: maximisation_bias.Course}, achieved, ceiling)}, on a log scale.
+    """How values went, a panel each: {title: ({label: maximisation_bias.Course}, achieved, ceiling)}, on a
+    log scale.
 
     The label "maximum" is orange; dashed lines show what was achieved and what no policy can exceed.
     """
