@@ -309,9 +309,7 @@ def test_workers_keep_the_memory_that_they_use_again(client):
 
 def test_two_workers_do_what_one_process_does_and_a_failure_spoils_only_its_own_entry(data, tmp_path, client):
     grid = Grid(("BallRun",), ("IQL", "C2IQL", "BC-Safe"), seeds=2)
-    chosen = make_entries(
-        grid, data
-    )  # BC-Safe has no episode to learn from at 30, which its others do not survive
+    chosen = make_entries(grid, data)  # BC-Safe has no episode at 30, so none of its runs is trained
     folder = tmp_path / "runs" / "study"
     failures = cluster.run_all(chosen, folder, client, progress=False)
     (failed,) = failures

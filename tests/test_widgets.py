@@ -1,6 +1,5 @@
 """A slider's callback is a plain function: another limit, another picture. Code shown is the library's."""
 
-import dataclasses
 import io
 
 import matplotlib
@@ -8,7 +7,6 @@ import numpy as np
 import pytest
 
 from tutorial_lib.agents import C2IQL
-from tutorial_lib.config import get_profile
 from tutorial_lib.course import widgets
 from tutorial_lib.tasks import get_task
 
@@ -16,7 +14,7 @@ from tutorial_lib.tasks import get_task
 @pytest.fixture(scope="module")
 def agent():
     matplotlib.use("Agg")
-    config = dataclasses.replace(get_profile("small"), hidden_width=8, crm_width=8, crm_layers=1)
+    config = C2IQL.configure(hidden_width=8, crm_width=8, crm_layers=1)
     return C2IQL(get_task("BallCircle"), config)
 
 

@@ -113,11 +113,12 @@ def test_an_update_of_several_runs_is_plain_pytorch_on_each(kind):
 
 
 @every_algorithm
-def test_a_network_moves_and_an_update_leaves_nothing_behind_but_numbers(kind):
+def test_networks_and_actions_move_and_an_update_leaves_nothing_behind_but_numbers(kind):
     """A graph that the targets or variables kept would grow with every update."""
     agent = make_agent(kind)
     data, generators = start(agent)
     before = {key: value.clone() for key, value in agent.state().items()}
+    actions = [agent.act(*some_episodes(), run) for run in range(3)]
     for _ in range(3):
         scalars = agent.update(agent.draw_all(data, generators))
     kept = [*scalars.values(), *agent.variables.values()]
@@ -127,6 +128,7 @@ def test_a_network_moves_and_an_update_leaves_nothing_behind_but_numbers(kind):
     for key, value in agent.state().items():
         if key.startswith(("online.", "target.")):
             assert all((value[run] != before[key][run]).any() for run in range(3)), key
+    assert all((agent.act(*some_episodes(), run) != actions[run]).any() for run in range(3))
 
 
 # --- Checkpoints and files ---
