@@ -67,7 +67,7 @@ class RecordedTask(gymnasium.Wrapper):
         """Begin an episode and return (observation, info). `rng` seeds the simulator: `seed` is ignored."""
         self.begin_episode()
         self.observation, info = self.env.reset(seed=int(self.rng.integers(2**31)))
-        self.record = {key: [] for key in KEYS}
+        self.record: dict[str, list] = {key: [] for key in KEYS}
         return self._observed(), info
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
@@ -90,7 +90,7 @@ class RecordedTask(gymnasium.Wrapper):
             self.record[key].append(value)
         if terminated or truncated:
             self.episodes.append({key: np.asarray(values) for key, values in self.record.items()})
-        reward = reward * self.task.horizon / self.task.max_return - self.charge(info["cost"])
+        reward = float(reward) * self.task.horizon / self.task.max_return - self.charge(info["cost"])
         return self._observed(), float(reward), terminated, truncated, info
 
     def _observed(self) -> np.ndarray:

@@ -17,6 +17,7 @@ import json
 from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import joblib
 import numpy as np
@@ -106,9 +107,15 @@ def _origin(task: Task, recipe: Recipe) -> dict[str, str]:
 # their episodes, and then for the few episodes that are kept.
 
 
+def _load(file: Path) -> Dataset:
+    """The episodes of a file."""
+    arrays: dict[str, Any] = load_file(file)
+    return Dataset(**arrays)
+
+
 def _table(file: Path) -> pd.DataFrame:
     """One row for each episode of a file: the file, the episode's place in it, its cost and its return."""
-    data = Dataset(**load_file(file))
+    data = _load(file)
     place = np.arange(data.num_episodes)
     return pd.DataFrame(
         {"file": str(file), "place": place, "cost": data.episode_costs, "return": data.episode_returns}
@@ -118,10 +125,11 @@ def _table(file: Path) -> pd.DataFrame:
 def _read(chosen: pd.DataFrame) -> Dataset:
     """The episodes of these rows of the tables, which stand in the order of the tables."""
     parts = [
-        Dataset(**load_file(file)).select(rows["place"].to_numpy())
+        _load(Path(str(file))).select(rows["place"].to_numpy())
         for file, rows in chosen.groupby("file", sort=False)
     ]
-    return Dataset(**{key: np.concatenate([getattr(part, key) for part in parts]) for key in KEYS})
+    arrays: dict[str, Any] = {key: np.concatenate([getattr(part, key) for part in parts]) for key in KEYS}
+    return Dataset(**arrays)
 
 
 def thin(

@@ -3,6 +3,8 @@
 This module imports stable-baselines3, which takes seconds. Import it where it is needed.
 """
 
+from typing import Any
+
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 
@@ -66,10 +68,12 @@ class Schedule(BaseCallback):
 
     def _on_rollout_start(self) -> None:
         self.progress = min((self.first_step + self.model.num_timesteps) / self.recipe.steps, 1.0)
-        self.model.env.set_attr("price_scale", self._price_scale())
+        envs: Any = self.model.env
+        envs.set_attr("price_scale", self._price_scale())
         calm = self.recipe.calm
         if calm is not None and self.progress >= calm[0]:
-            self.model.policy.log_std.data.clamp_(max=np.log(calm[1]))
+            log_std: Any = self.model.policy.log_std
+            log_std.data.clamp_(max=np.log(calm[1]))
 
     def _price_scale(self) -> float:
         if self.kind == "lagrangian":

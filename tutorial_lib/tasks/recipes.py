@@ -5,6 +5,7 @@ thins the episodes. This module imports nothing slow, so that the command line c
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 
 @dataclass(frozen=True)
@@ -59,11 +60,11 @@ class Recipe:
     one direction works in all directions. The data keep the simulator's observations."""
 
 
-_RUN = {"prices": (0.2, 1.5), "allowance_share": 1.0, "allowances": (-0.2, 1.0), "ramp": None}
+_RUN: dict[str, Any] = {"prices": (0.2, 1.5), "allowance_share": 1.0, "allowances": (-0.2, 1.0), "ramp": None}
 # Without target_kl DroneCircle's drone unlearned to fly: returns were highest after 1.3 million steps, and
 # the share of episodes that end in a fall rose from 8% to over 30%. With a learning rate of 3e-4 the drone
 # earned 14 after 200,000 steps, with target_kl 106.
-_LONG = {"width": 128, "target_kl": 0.02, "return_bins": 1}
+_LONG: dict[str, Any] = {"width": 128, "target_kl": 0.02, "return_bins": 1}
 
 RECIPES: dict[str, Recipe] = {
     "BallRun": Recipe(episodes=940, steps=1_000_000, **_RUN),
