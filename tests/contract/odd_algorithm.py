@@ -1,8 +1,6 @@
-"""An algorithm that uses everything that the interface allows, and learns nothing worth having.
+"""An algorithm that uses everything that the interface allows. It is of no use but for tests.
 
-Sources: none. It exists for the contract's tests.
-
-Departures: none, for the same reason.
+Sources: none.
 """
 
 from dataclasses import dataclass
@@ -34,7 +32,7 @@ class OddConfig(Config):
 
 
 class Actor(nn.Module):
-    """Attention over the numbers of an observation, in the light of a kind of limit."""
+    """Attention over the numbers of an observation, given a kind of limit."""
 
     def __init__(self, task):
         super().__init__()
@@ -75,7 +73,7 @@ class DicePlayer(Player):
 
 
 class Odd(Agent):
-    """Clones what a critic of costs calls cheap, at a price that moves. It is trained for one limit."""
+    """Clones actions, and pays a price for what a critic expects them to cost. It is trained for one limit."""
 
     name = "Odd one"
     Config = OddConfig
