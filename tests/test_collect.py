@@ -274,7 +274,7 @@ def at(schedule, steps):
     """The price scale that the schedule sets before the batch that begins after so many steps of a slice."""
     scales = []
     env = SimpleNamespace(set_attr=lambda name, value: scales.append((name, value)))
-    schedule.model = SimpleNamespace(num_timesteps=steps, env=env)
+    schedule.model = SimpleNamespace(num_timesteps=steps, get_env=lambda: env)
     schedule.on_rollout_start()
     ((name, value),) = scales
     assert name == "price_scale"

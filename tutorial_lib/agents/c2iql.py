@@ -168,8 +168,7 @@ class C2IQL(ConstrainedAgent):
     def losses(self, net: Networks, batch: Fields) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
         config, a, limit = self.config, batch.actions, batch.limit
         s = self.network_input(net, batch.observations, limit)
-        # s' has the same limit as s, because a limit stands for a cost rate.
-        s_next = self.network_input(net, batch.next_observations, limit)
+        s_next = self.network_input(net, batch.next_observations, limit)  # a limit stands for a cost rate
 
         # Lines 6-8: cost reconstruction. The critic that predicts the highest cost counts.
         q_cost = net.target_cost_critics(s, a)  # (k, B, m)
@@ -209,12 +208,8 @@ class C2IQL(ConstrainedAgent):
 
         of_networks = {"value": value_loss, "cost_value": cost_value_loss, "critic": critic_loss}
         of_networks |= {"cost_critic": cost_critic_loss, "policy": policy_loss}
-        return of_networks, {
-            "safe_fraction": (cost <= limit).float().mean(),
-            "cost_mean": cost.mean(),
-            "value_mean": v.mean(),
-            "negative_q": (q_reward < 0).float().mean(),
-        }
+        scalars = self.logged(cost, limit, v, q_reward) | {"cost_mean": cost.mean()}
+        return of_networks, scalars
 
     def player(self, limits: Sequence[float] | np.ndarray, seeds: Sequence[int], run: int = 0) -> Player:
         return BudgetPlayer(self, limits, run) if self.conditioned else super().player(limits, seeds, run)

@@ -81,8 +81,4 @@ class CIQL(ConstrainedAgent):
 
         of_networks = {"value": value_loss, "cost_value": cost_value_loss, "critic": critic_loss}
         of_networks |= {"cost_critic": cost_critic_loss, "policy": policy_loss}
-        return of_networks, {
-            "safe_fraction": (cost <= limit).float().mean(),
-            "value_mean": v.mean(),
-            "negative_q": (q_reward < 0).float().mean(),
-        }
+        return of_networks, self.logged(cost, limit, v, q_reward)

@@ -136,6 +136,14 @@ class ConstrainedAgent(ImplicitAgent):
         """Returns 1 where Q_c bootstraps and 0 where nothing follows, (B,)."""
         return goes_on(batch, self.config.time_limits)
 
+    def logged(self, cost: Tensor, limit: Tensor, v: Tensor, q_reward: Tensor) -> dict[str, Tensor]:
+        """Returns what the log says besides the losses. Costs, limits, V_r and Q_r are (B,)."""
+        return {
+            "safe_fraction": (cost <= limit).float().mean(),
+            "value_mean": v.mean(),
+            "negative_q": (q_reward < 0).float().mean(),
+        }
+
     def penalised_q(
         self, net: Networks, q_reward: Tensor, cost: Tensor, value_cost: Tensor, limit: Tensor
     ) -> Tensor:

@@ -107,6 +107,23 @@ def input_noise(task: Task, config: ReconstructionConfig) -> Tensor:
     return (config.crm_noise**2 + rate**2).sqrt()
 
 
+def _training_sums(
+    task: Task, dataset: Dataset, rng: np.random.Generator, device: torch.device | str
+) -> tuple[Tensor, Tensor, Tensor, int]:
+    """Returns discounted sums (n, m), sums and weights (n,), and the number of the dataset's, which come
+    first.
+
+    The weights of the dataset's episodes and those of the random sequences sum to 1/2 each.
+    """
+    sums = [episode_sums(dataset, task), random_sums(task, POOL, rng)]
+    x, y = (
+        torch.as_tensor(np.concatenate(part), dtype=torch.float64).to(device)
+        for part in zip(*sums, strict=True)
+    )
+    half = [torch.full((len(part),), 0.5 / len(part), dtype=torch.float64) for _, part in sums]
+    return x, y, torch.cat(half).to(device), len(sums[0][1])
+
+
 def _whiten(model: CostReconstruction, x: Tensor, share: Tensor, noise_std: Tensor) -> None:
     """Sets the mean and the whitening matrix of inputs x (n, m) with weights `share` (n,) and this noise."""
     model.mean.copy_(share @ x)
@@ -144,20 +161,14 @@ def train_reconstruction(
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         model = CostReconstruction(task, config).to(device)
-    sums = [episode_sums(dataset, task), random_sums(task, POOL, rng)]
-    x, y = (
-        torch.as_tensor(np.concatenate(part), dtype=torch.float64).to(device)
-        for part in zip(*sums, strict=True)
-    )
-    half = [torch.full((len(part),), 0.5 / len(part), dtype=torch.float64) for _, part in sums]
-    share = torch.cat(half).to(device)  # the weights of episodes and of random sequences sum to 1/2 each
+    x, y, share, boundary = _training_sums(task, dataset, rng, device)
     noise_std = input_noise(task, config).to(x)
     _whiten(model, x, share, noise_std)
     if config.crm == "linear":
         _solve(model, x, y, share)
         return model.requires_grad_(False)
 
-    x, y, boundary = x.float(), y.float(), len(sums[0][1])
+    x, y = x.float(), y.float()
     optimiser = torch.optim.Adam(model.parameters(), lr=1e-3)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, config.crm_steps)
     for _ in trange(config.crm_steps, desc="cost reconstruction", disable=not progress, leave=False):
