@@ -73,7 +73,7 @@ class DicePlayer(Player):
 
 
 class Odd(Agent):
-    """Clones actions, and pays a price for what a critic expects them to cost. It is trained for one limit."""
+    """Clones actions, and pays a price for what a critic expects them to cost, under one limit."""
 
     name = "Odd one"
     Config = OddConfig
