@@ -218,12 +218,12 @@ class Agent(Runs):
             raise ValueError(f"{self.name} {verb}")
         if limits is None:
             return None
-        limits = [limits] * len(self.seeds) if isinstance(limits, int | float) else list(limits)
-        if len(limits) != len(self.seeds):
-            raise ValueError(
-                f"{len(limits)} limits for {len(self.seeds)} seeds: give one limit, or one per seed"
-            )
-        return tuple(check_limit(limit) for limit in limits)
+        given = np.asarray(limits, float)
+        given = np.full(len(self.seeds), given) if given.ndim == 0 else given
+        if given.shape != (len(self.seeds),):
+            count = f"{given.size} limits for {len(self.seeds)} seeds"
+            raise ValueError(f"{count}: give one limit, or one per seed")
+        return tuple(check_limit(limit) for limit in given.tolist())
 
     def _tensor(self, x: Any) -> Tensor:
         return torch.as_tensor(np.asarray(x, np.float32), device=self.device)

@@ -63,7 +63,7 @@ def refuse_hidden_state(module: nn.Module) -> None:
     for name, layer in module.named_modules():
         where = f"layer {name or 'itself'!r} ({type(layer).__name__}) of {type(module).__name__}"
         drops = isinstance(layer, nn.modules.dropout._DropoutNd) and layer.p > 0
-        if drops or (isinstance(layer, nn.MultiheadAttention) and layer.dropout > 0):
+        if drops or (isinstance(layer, nn.MultiheadAttention | nn.RNNBase) and layer.dropout > 0):
             raise ValueError(
                 f"{where} draws a dropout mask by itself: draw it in `draw`, and multiply by it in `losses`"
             )

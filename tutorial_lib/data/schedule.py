@@ -68,8 +68,7 @@ class Schedule(BaseCallback):
 
     def _on_rollout_start(self) -> None:
         self.progress = min((self.first_step + self.model.num_timesteps) / self.recipe.steps, 1.0)
-        envs: Any = self.model.env
-        envs.set_attr("price_scale", self._price_scale())
+        self.training_env.set_attr("price_scale", self._price_scale())
         calm = self.recipe.calm
         if calm is not None and self.progress >= calm[0]:
             log_std: Any = self.model.policy.log_std
