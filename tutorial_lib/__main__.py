@@ -1,7 +1,7 @@
-"""The command line: `c2iql tasks | collect | fetch | train | evaluate | study | report`.
+"""This module is the command line: `c2iql tasks | collect | fetch | train | evaluate | study | report`.
 
-tyro turns functions and dataclasses into commands with help and types, so no option is written twice.
-Everything else is imported inside the commands: `c2iql --help` answers at once.
+tyro makes commands with types and help from functions and dataclasses, so each option is written only once.
+The commands import the other modules when they run, so that `c2iql --help` is fast.
 """
 
 import dataclasses
@@ -20,7 +20,7 @@ Device = Literal["cpu", "cuda"]
 
 
 def tasks() -> None:
-    """List the tasks: horizon, dimensions, limits, reference returns."""
+    """List the tasks with their horizons, dimensions, limits and reference returns."""
     import pandas as pd
 
     from tutorial_lib.tasks import TASKS
@@ -33,11 +33,11 @@ def tasks() -> None:
 
 
 def fetch(task: tyro.conf.Positional[str], directory: Path | None = None) -> None:
-    """Download DSRL's dataset of a task, and check it.
+    """Download DSRL's dataset of a task and check it.
 
     Args:
-        task: which task, e.g. CarCircle.
-        directory: where to; default DSRL_DATASET_DIR or ~/.dsrl/datasets.
+        task: This is the name of the task, e.g. CarCircle.
+        directory: The file is written to this folder. The default is DSRL_DATASET_DIR or ~/.dsrl/datasets.
     """
     from tutorial_lib.data.sources import fetch_dataset
 
@@ -53,18 +53,19 @@ def collect(
     runs: Path = Path("runs/collect"),
     workers: int = 2,
 ) -> None:
-    """Make a dataset from the simulator with PPO agents of two kinds, thinned on a cost-return grid.
+    """Make a dataset from the simulator with PPO agents of two kinds.
 
-    A killed collection continues where it was.
+    The episodes are subsampled on a grid of cost and return. A collection that was killed continues from its
+    saved state when you run the command again.
 
     Args:
-        task: which task, e.g. BallCircle.
-        out: the file to write; default runs/collect/TASK.hdf5.
-        sources: one PPO run each: a kind, priced or lagrangian, and a seed.
-        steps: simulator steps of each run; default the task's recipe.
-        episodes: about how many to keep; default the task's recipe.
-        runs: folder for what is kept between a kill and a resume.
-        workers: PPO runs side by side.
+        task: This is the name of the task, e.g. BallCircle.
+        out: The dataset is written to this file. The default is runs/collect/TASK.hdf5.
+        sources: These are one PPO run each, with a kind, which is priced or lagrangian, and a seed.
+        steps: Each run makes this number of simulator steps. The default is in the task's recipe.
+        episodes: The dataset keeps about this number of episodes. The default is in the task's recipe.
+        runs: This folder holds the saved state of the collection.
+        workers: This number of PPO runs train at the same time.
     """
     from tutorial_lib.data import collect as collecting
     from tutorial_lib.tasks import get_task
@@ -81,9 +82,9 @@ def collect(
 def train(words: tuple[str, ...] = ()) -> None:
     """Train an agent and save it with its log: `c2iql train [ALGORITHM] TASK [options]`.
 
-    Several seeds train together. A killed run continues where it was. Without options it makes the agent of
-    the results' table. `c2iql train ALGORITHM --help` shows all options of an algorithm; the default is
-    C2IQL.
+    Several seeds train together. A run that was killed continues from its last checkpoint when you run the
+    command again. Without options, the command trains with the settings of the table of results.
+    `c2iql train ALGORITHM --help` shows all options of an algorithm. The default algorithm is C2IQL.
     """
     from tutorial_lib import checkpoints, training
     from tutorial_lib.agents import slug
@@ -117,14 +118,15 @@ def evaluate(
     episodes: int = 10,
     workers: int = 2,
 ) -> None:
-    """Run a trained agent in the simulator; print scores and save every episode.
+    """Run a trained agent in the simulator, print its scores and save the results of every episode.
 
     Args:
-        agent: an agent.safetensors or a checkpoint.safetensors.
-        out: the CSV to write; default beside the agent, e.g. agent-results.csv.
-        limits: on the cost of an episode; default the task's own, or those that the agent was trained for.
-        episodes: per run and limit.
-        workers: processes; the results do not depend on their number.
+        agent: This is the path of an agent.safetensors or a checkpoint.safetensors.
+        out: The results are written to this CSV. The default is beside the agent, e.g. agent-results.csv.
+        limits: These are limits of the episode cost. The default is the limits for which the agent was
+            trained, or the task's own limits.
+        episodes: This is the number of episodes per run and limit.
+        workers: This is the number of processes. The results do not depend on it.
     """
     from tutorial_lib import checkpoints, playing, scores
 
@@ -151,22 +153,26 @@ def study(
     out: Path | None = None,
     dry: Annotated[bool, tyro.conf.arg(name="list")] = False,
 ) -> None:
-    """Run a study, a grid of training runs and their episodes, and gather its results in one CSV.
+    """Run a study and write its results to one CSV.
 
-    Entries that are finished are skipped, and those that were killed continue from their last checkpoint.
-    Equal agents that are shipped, or that another study trained, are not trained again.
+    A study is a grid of training runs, which are then evaluated. Each entry of the grid is one set of runs.
+    Entries that are finished are skipped. Entries that were killed continue from their last checkpoint. An
+    agent is not trained again where an equal agent is shipped or was trained in another study.
 
     Args:
-        name: which study, e.g. ablations; a wrong one prints the list.
-        only: run only the entries whose name has this in it, a pattern such as CarCircle*CIQL.
-        scheduler: address of a dask scheduler; default one process for each core of this machine.
-        workers: processes on this machine.
-        profile: of every run.
-        option: changes to every run that has this option, for a trial, e.g. updates=200 crm_steps=100.
-        data: shipped, or dsrl.
-        runs: folder of all studies' runs.
-        out: the CSV to write; default data/results/NAME.csv, and in a trial runs/studies/NAME.csv.
-        dry: only list the entries, and which of them are finished.
+        name: This is the name of the study, e.g. ablations. An unknown name prints the list of studies.
+        only: Only entries whose name contains this pattern are run, e.g. CarCircle*CIQL.
+        scheduler: This is the address of a dask scheduler. Without it, one process runs on each core of this
+            machine.
+        workers: This is the number of processes on this machine.
+        profile: This is the profile of every run.
+        option: These are changes for a trial, e.g. updates=200 crm_steps=100. Each changes every run that has
+            the option.
+        data: This is shipped or dsrl.
+        runs: This folder holds the runs of all studies.
+        out: The results are written to this CSV. The default is data/results/NAME.csv, and in a trial
+            runs/studies/NAME.csv.
+        dry: The command only lists the entries and says which are finished.
     """
     check_counts(workers=workers)
     question, whole, chosen = _entries(name, only, profile, option, data)
@@ -181,7 +187,7 @@ def study(
 def _entries(
     name: str, only: str, profile: str, option: tuple[str, ...], data: str
 ) -> tuple[str, list["Runs"], list["Runs"]]:
-    """A study's question, all of its entries, and those that are to be run."""
+    """Returns a study's question, all of its entries, and the entries that `only` selects."""
     from tutorial_lib.options import with_options
     from tutorial_lib.studies import grids
 
@@ -192,7 +198,7 @@ def _entries(
 
 
 def _list_entries(chosen: list["Runs"], folder: Path) -> None:
-    """Print which entries are finished."""
+    """Prints the name of each entry and whether it is finished."""
     from tutorial_lib.studies.runs import results_path
 
     for entry in chosen:
@@ -208,7 +214,10 @@ def _run_entries(
     scheduler: str | None,
     workers: int | None,
 ) -> None:
-    """Run entries, and gather the results of the whole study. Raises ValueError where some failed."""
+    """Runs the chosen entries and writes the results of the whole study.
+
+    Raises ValueError where an entry failed.
+    """
     from tutorial_lib.studies import cluster, results
     from tutorial_lib.studies.runs import collect as gather
 
@@ -225,11 +234,12 @@ def _run_entries(
 
 
 def report(name: tyro.conf.Positional[str | None] = None) -> None:
-    """Make tables and figures from the results' files: of one study, or all, and the pages that show them.
+    """Make tables and figures from the results' files, for one study or for all studies.
 
     Args:
-        name: a study, whose table is printed and whose figure is drawn; without it README.md, data/README.md,
-            the pictures of the datasets and all studies' figures.
+        name: This is a study whose table is printed and whose figure is drawn. Without it, the command
+            writes README.md, data/README.md, the figures of the datasets and the figures of all
+            studies.
     """
     from tutorial_lib.studies import report as reporting
 
@@ -242,14 +252,14 @@ def report(name: tyro.conf.Positional[str | None] = None) -> None:
 
 
 def check_counts(**numbers: int | None) -> None:
-    """ValueError for an argument that must be at least one and is not."""
+    """Raises ValueError where a number is less than 1. None is allowed."""
     for name, number in numbers.items():
         if number is not None and number < 1:
             raise ValueError(f"--{name} {number}: must be 1 or more")
 
 
 def check_device(device: Device) -> Device:
-    """The device itself, or ValueError where this machine has none."""
+    """Returns the device. Raises ValueError for `cuda` where PyTorch finds no CUDA device."""
     import torch
 
     if device == "cuda" and not torch.cuda.is_available():
@@ -258,14 +268,14 @@ def check_device(device: Device) -> Device:
 
 
 def main() -> None:
-    """Entry point: errors that a user can mend are one line, without a traceback."""
+    """Runs the command line. A ValueError or an OSError is printed in one line, without a traceback."""
     words = sys.argv[1:]
     if words == ["--version"]:
         print(f"c2iql {version('c2iql-tutorial')}")
         return
     commands = {f.__name__: f for f in (tasks, collect, fetch, train, evaluate, study, report)}
     try:
-        if words[:1] == ["train"]:  # its options depend on its first words
+        if words[:1] == ["train"]:  # the options of `train` depend on its first arguments
             train(tuple(words[1:]))
         else:
             tyro.extras.subcommand_cli_from_dict(

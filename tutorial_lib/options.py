@@ -1,5 +1,7 @@
-"""Options for people: those of `c2iql train`, which depend on the algorithm, a study's changes, and a
-table."""
+"""This module reads the options of `c2iql train` and the changes of a study's options, and describes options.
+
+The options of `c2iql train` depend on the algorithm.
+"""
 
 import ast
 import contextlib
@@ -20,29 +22,29 @@ from tutorial_lib.tasks import get_task
 
 @dataclasses.dataclass(frozen=True)
 class Training:
-    """What `c2iql train` is told besides the options of the algorithm."""
+    """These are the arguments of `c2iql train` that are common to all algorithms."""
 
     task: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="TASK")]
-    """Which task, e.g. BallCircle."""
+    """This is the name of the task, e.g. BallCircle."""
     config: tyro.conf.OmitArgPrefixes[Any]
     seeds: tuple[int, ...] = (0,)
-    """One run each, trained together."""
+    """There is one run for each seed. The runs train together."""
     limits: tuple[float, ...] = ()
-    """Only for algorithms that are trained for one limit: every seed is trained for each of these, in unsafe
-    steps per episode. Default: the task's own limits."""
+    """There is one run for each seed and each of these limits, in unsafe steps per episode. The option is
+    only for algorithms that are trained for one limit. The default is the task's own limits."""
     data: str = "shipped"
-    """shipped, dsrl, or a file."""
+    """This is `shipped`, `dsrl` or the path of a dataset file."""
     out: Path | None = None
-    """Folder of the run; default runs/TASK/ALGORITHM-PROFILE."""
+    """This is the folder of the runs. The default is runs/TASK/ALGORITHM-PROFILE."""
     device: Literal["cpu", "cuda"] = "cpu"
-    """Where to train."""
+    """This is the device on which the agent trains."""
 
 
 def parse_training(words: Sequence[str]) -> tuple[type[Agent], Training]:
-    """The algorithm and the arguments of `c2iql train [ALGORITHM] TASK [options]`.
+    """Returns the algorithm and the arguments of `c2iql train [ALGORITHM] TASK [options]`.
 
-    The algorithm, the profile and the task decide the options' defaults. Raises ValueError for a name that is
-    unknown, and where the task does not stand before the options.
+    The defaults of the options depend on the algorithm, the profile and the task. Raises ValueError for an
+    unknown name, and where the task does not stand before the options.
     """
     words = list(words)
     names = {*ALGORITHMS, *map(slug, ALGORITHMS)}
@@ -62,29 +64,30 @@ def parse_training(words: Sequence[str]) -> tuple[type[Agent], Training]:
         f"Other algorithms: c2iql train ALGORITHM --help, with one of {', '.join(map(slug, ALGORITHMS))}."
     )
     if {"-h", "--help"} & set(words):
-        words = ["--help"]  # after a task, tyro's help would leave out TASK
+        words = ["--help"]  # after a task, tyro's help does not show TASK
     args: Any = tyro.cli(options, args=words, prog=f"c2iql train {slug(kind.name)}")
-    if task is None:  # the defaults would lack the task's own options
+    if task is None:  # the defaults do not include the task's own options
         raise ValueError("write the task before the options: c2iql train [ALGORITHM] TASK [options]")
     return kind, args
 
 
 def _profile(words: Sequence[str]) -> str:
-    """The last profile that is named in `words`, or `small`."""
+    """Returns the last profile that `words` name, or `small` where they name none."""
     profile = "small"
     for word, following in itertools.pairwise([*words, ""]):
         if word == "--profile":
-            profile = following or profile  # tyro reports a missing name
+            profile = following or profile  # tyro reports that the name is missing
         elif word.startswith("--profile="):
             profile = word.partition("=")[2]
     return profile
 
 
 def with_options(config: Config, options: Sequence[str], others: Sequence[str] = ()) -> Config:
-    """The config with changes that are written `NAME=VALUE`.
+    """Returns the config with changes that are written `NAME=VALUE`.
 
-    A value is read as the option's own type. A change of an option that only `others` have is left out: a
-    study's algorithms do not read the same options. Raises ValueError.
+    A value is read as the option's own type. The algorithms of a study have different options. A change is
+    therefore ignored where its option is in `others` but not in this config. Raises ValueError for an unknown
+    option and for a value of the wrong type.
     """
     types = get_type_hints(type(config))
     own = [field.name for field in dataclasses.fields(config)]
@@ -96,20 +99,23 @@ def with_options(config: Config, options: Sequence[str], others: Sequence[str] =
             raise ValueError(f"--option {option}: write NAME=VALUE with one of {', '.join(names)}")
         if name not in own:
             continue
-        said = io.StringIO()  # tyro's message is about another command line
+        said = io.StringIO()  # tyro's message describes a different command line
         try:
             with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
                 changes[name] = tyro.cli(types[name], args=[text])
         except SystemExit:
             kind = "True or False" if types[name] is bool else inspect.formatannotation(types[name])
             raise ValueError(f"--option {option}: the value must be {kind}") from None
-    return config.changed(**changes)  # all at once: what fits together may come in any order
+    return config.changed(**changes)  # all changes are made together, so their order does not matter
 
 
 def describe(kind: type[Config]) -> dict[str, str]:
-    """What each option of a class of options means, by name: the docstrings that follow the fields."""
+    """Returns the meaning of each option of a class of options, by the option's name.
+
+    The meaning is the docstring that follows the field.
+    """
     words: dict[str, str] = {}
-    for owner in reversed(kind.__mro__[:-1]):  # not object
+    for owner in reversed(kind.__mro__[:-1]):  # `object` is excluded
         body = ast.parse(inspect.getsource(owner)).body[0].body  # type: ignore[attr-defined]
         for field, following in zip(body, body[1:], strict=False):
             if isinstance(field, ast.AnnAssign) and isinstance(following, ast.Expr):

@@ -1,7 +1,7 @@
-"""The course's style: colours, type sizes, and figures that a notebook stores small.
+"""This module defines the colours and font sizes of the course's figures, and figures with small files.
 
-Everywhere cost is vermilion, reward blue and a limit a dashed line (Okabe and Ito's colours, which
-colour-blind readers tell apart).
+In every figure, cost is vermilion, reward is blue and a limit is a dashed line. The colours are from the
+palette of Okabe and Ito, which colour-blind readers can distinguish.
 """
 
 import base64
@@ -32,29 +32,38 @@ STYLE: Any = {
 
 
 class Picture(Figure):
-    """A figure that a notebook stores in 256 colours: half of the bytes or less, and no difference to see."""
+    """This is a figure that a notebook stores as a PNG image of 256 colours.
+
+    The image has at most half of the bytes of a full-colour image, and the difference is not visible.
+    """
 
     def small_png(self) -> bytes:
-        """The picture in 256 colours."""
+        """Returns the figure as a PNG image of 256 colours."""
         file, small = io.BytesIO(), io.BytesIO()
         self.savefig(file, format="png", bbox_inches="tight")
         image = Image.open(file).convert("RGB").quantize(256, dither=Image.Dither.NONE)
         image.save(small, "PNG", optimize=True)
         return small.getvalue()
 
-    def _ipython_display_(self):  # comes before matplotlib's own way, which _repr_png_ would not
+    # IPython prefers this method to matplotlib's own display. It would not prefer _repr_png_.
+    def _ipython_display_(self):
+        """Shows the image of 256 colours in a notebook."""
         png = base64.b64encode(self.small_png()).decode()
         display({"image/png": png, "text/plain": repr(self)}, raw=True)
 
 
 def subplots(*args: Any, **options: Any) -> tuple[Picture, Any]:
-    """matplotlib's `subplots`, whose figure is a `Picture`: the figure and its axes."""
+    """Returns the figure and the axes of matplotlib's `subplots`, where the figure is a `Picture`."""
     figure, axes = plt.subplots(*args, FigureClass=Picture, **options)  # type: ignore[call-overload]
     return figure, axes
 
 
 def one_figure(draw):
-    """In the course's style, whatever the caller's; ticks are made when drawn, so drawing belongs inside."""
+    """Returns a version of `draw` that uses the course's style and closes its figure.
+
+    matplotlib makes the ticks when it renders the figure. The figure is therefore rendered while the style is
+    active.
+    """
 
     @functools.wraps(draw)
     def in_style(*args, **options):
@@ -68,7 +77,7 @@ def one_figure(draw):
 
 
 def task_panels(tasks, height: float, **options):
-    """One panel per task name, four in a row; empty places stay empty."""
+    """Returns a figure and its axes, with one panel for each task name and at most four panels in a row."""
     columns = min(4, len(tasks))
     lines = -(-len(tasks) // columns)
     figure, axes = subplots(lines, columns, figsize=(12, height * lines), squeeze=False, **options)
@@ -80,6 +89,7 @@ def task_panels(tasks, height: float, **options):
 
 
 def legend_below(figure, *axes):
+    """Draws one legend below the panels. It has one entry for each different label of `axes`."""
     entries = {
         label: handle for ax in axes for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)
     }

@@ -1,6 +1,8 @@
-"""Studies: variants side by side, the expectiles, the noise, every task against the paper's.
+"""The figures of the studies: variants, expectiles, noise, and each task beside the paper's values.
 
-A dot is a seed, a larger mark their mean. All draw from raw results; without rows they say so.
+Every figure is drawn from raw results. In the figures of seeds a small mark is a seed, and a larger mark is
+the mean of the seeds. If the results have no rows, a figure with the decorator `or_not_run` says that the
+study was not run.
 """
 
 import functools
@@ -31,7 +33,7 @@ PANELS = (("reward_score", "normalised return", REWARD), ("cost_score", "normali
 
 
 def or_not_run(draw):
-    """A figure of no rows is a line of text: the study was not run."""
+    """Returns a version of `draw` that says, if the results have no rows, that the study was not run."""
 
     @functools.wraps(draw)
     def maybe(results, *args, **options):
@@ -46,11 +48,11 @@ def or_not_run(draw):
 
 
 def variant_names(results: pd.DataFrame) -> pd.Series:
-    """What distinguishes each row's run within its study, in a few words."""
+    """Returns a short name for each row: the options that differ between the runs of its study."""
     options = [name for name in options_of(results) if results[name].nunique(dropna=False) > 1]
     if not options:
         return results["algorithm"]
-    if "crm" in options or "crm_width" in options:  # the size of the reconstruction model
+    if "crm" in options or "crm_width" in options:  # The variants differ in the size of the model.
         sizes = results["crm_layers"].astype(str) + " x " + results["crm_width"].astype(str)
         return sizes.where(results["crm"] != "linear", "linear")
     names = results[options[0]].astype(str) if len(options) == 1 else None
@@ -62,7 +64,7 @@ def variant_names(results: pd.DataFrame) -> pd.Series:
 @one_figure
 @or_not_run
 def variants(results):
-    """Return and cost at each limit, a line for each variant: tasks from top to bottom."""
+    """Draws return and cost at each limit, with one row of panels per task and one line per variant."""
     results = results.assign(variant=variant_names(results))
     tasks, names = list(results["task"].unique()), list(results["variant"].unique())
     size = (12, 3.6 * len(tasks) + 0.8)
@@ -85,7 +87,7 @@ def variants(results):
 
 
 def _seeds_by(ax, part, column, values, score, index, shift, label):
-    """Seeds as dots and their mean as a line, over the places of `values` of a column."""
+    """Draws each seed as a dot and the means as a line, over the `values` of `column`."""
     style = {"color": VARIANTS[index % len(VARIANTS)], "marker": MARKS[index % len(MARKS)]}
     x = [place + shift for place in range(len(values))]
     scores = [part.loc[part[column] == value, score].to_numpy() for value in values]
@@ -98,7 +100,7 @@ def _seeds_by(ax, part, column, values, score, index, shift, label):
 @one_figure
 @or_not_run
 def expectiles(results, limit: float = 50):
-    """The paper's Fig. 4: return and cost over kappa_1, a line for each kappa_2, at one limit."""
+    """Draws the paper's Fig. 4: return and cost over kappa_1 at one limit, with one line per kappa_2."""
     part = seed_means(results[results["threshold"] == limit], ("kappa_1", "kappa_2"))
     values, others = (sorted(part[name].unique()) for name in ("kappa_1", "kappa_2"))
     figure, axes = subplots(1, 2, figsize=(12, 4.6))
@@ -119,7 +121,7 @@ def expectiles(results, limit: float = 50):
 @one_figure
 @or_not_run
 def noise_levels(results, limit: float = 50):
-    """The paper's Table 2 beside ours: return and cost of an episode over the noise in training the model."""
+    """Draws our results beside the paper's Table 2: return and cost over the noise in training the model."""
     part = results[results["threshold"] == limit].groupby(["crm_noise", "seed"])[["return", "cost"]].mean()
     part = part.reset_index()
     levels = sorted(part["crm_noise"].unique())
@@ -150,7 +152,7 @@ def noise_levels(results, limit: float = 50):
 @one_figure
 @or_not_run
 def against_paper(results, algorithm: str = "C2IQL"):
-    """Every task's return and cost: seeds, their mean with its 95% interval, and the paper's value."""
+    """Draws every task's return and cost beside the paper's: seeds as dots, their mean with a 95% interval."""
     part = seed_means(results[results["algorithm"] == algorithm], ("task",))
     tasks = list(part["task"].unique())
     figure, axes = subplots(1, 2, figsize=(12, 4.6))
@@ -179,10 +181,13 @@ def _interval_and_dots(ax, x, dots, colour, label):
 
 
 def algorithm_looks(results) -> dict[str, dict]:
-    """How each algorithm is drawn, by its place in the results: the same in every figure made of them."""
+    """Returns the colour and the marker of each algorithm, by its place in the results.
+
+    All figures of the same results therefore draw an algorithm in the same way.
+    """
     looks = {}
     for place, name in enumerate(results["algorithm"].unique()):
-        again = place // len(VARIANTS)  # colours repeat with another mark
+        again = place // len(VARIANTS)  # A repeated colour gets another mark.
         colour, mark = VARIANTS[place % len(VARIANTS)], MARKS[(place + again) % len(MARKS)]
         looks[name] = {"color": colour, "marker": mark, "markersize": 8}
     return looks
@@ -191,7 +196,7 @@ def algorithm_looks(results) -> dict[str, dict]:
 @one_figure
 @or_not_run
 def per_limit(results):
-    """The paper's Fig. 2: return and cost at each limit, a column for each task, a line per algorithm."""
+    """Draws the paper's Fig. 2: return and cost at each limit, a column per task, a line per algorithm."""
     results = with_scores(results)
     tasks, looks = list(results["task"].unique()), algorithm_looks(results)
     columns = min(4, len(tasks))
@@ -228,7 +233,10 @@ def per_limit(results):
 @one_figure
 @or_not_run
 def promises(results):
-    """What the critics expect of an episode, and what it pays: every agent's mean at every limit, by task."""
+    """Draws the predicted cost of an episode against the paid cost, with one panel per task.
+
+    Each mark is the mean of one agent at one limit.
+    """
     results = results[results["algorithm"].eq("C2IQL") & results["predicted_cost"].notna()]
     means = results.groupby(["task", "seed", "threshold"])[["predicted_cost", "cost"]].mean().reset_index()
     tasks = list(results["task"].unique())
@@ -253,10 +261,10 @@ def promises(results):
 
 @one_figure
 def expected_costs(log, recorded: float, unlimited: float):
-    """What long runs come to expect of the recorded actions: their mean cost, and the share that looks safe.
+    """Draws the mean expected cost of recorded actions in long runs, and the share that looks safe.
 
-    `log` has a row for each `cost_critics` and logged `update`; `recorded` is the mean cost of the recorded
-    episodes, `unlimited` the share of the transitions that are told infinity.
+    `log` has a row for each `cost_critics` and logged `update`. `recorded` is the mean cost of the recorded
+    episodes. `unlimited` is the share of the transitions whose given limit is infinite.
     """
     figure, axes = subplots(1, 2, figsize=(12, 4.6))
     panels = (("cost_mean", "expected cost of recorded actions"), ("safe_fraction", "share that looks safe"))
@@ -272,14 +280,14 @@ def expected_costs(log, recorded: float, unlimited: float):
 
 
 def study_figure(name: str, results):
-    """The figure that belongs to a study."""
+    """Draws the figure of the study with this name."""
     figures = {"kappas": expectiles, "crm-noise": noise_levels, "table1": per_limit}
     return figures.get(name, variants)(results)
 
 
 @one_figure
 def cost_return_plane(dataset, task: Task):
-    """Every episode of a dataset by its cost and its return, with the task's thresholds."""
+    """Draws every episode of a dataset by its cost and its return, with the task's thresholds."""
     figure, ax = subplots(figsize=(9, 5))
     ax.plot(dataset.episode_costs, dataset.episode_returns, "o", color=NEUTRAL, markersize=4, alpha=0.5)
     ax.set(xlabel="cost of the episode", ylabel="return of the episode")

@@ -1,7 +1,8 @@
-"""Tables made from files: the datasheet of the shipped data and the results, in the Markdown that shows them.
+"""This module writes the datasheet of the shipped data and the tables of results into the Markdown pages.
 
-A page keeps a pair of comments, `<!-- NAME:begin -->` and `<!-- NAME:end -->`; what stands between them
-is written here and nowhere else, and a test fails where it is out of date.
+All tables are computed from files. A page has a pair of comments for each table, `<!-- NAME:begin -->` and
+`<!-- NAME:end -->`. Only this module writes the text between them. A test fails where this text is out of
+date.
 """
 
 import hashlib
@@ -36,7 +37,7 @@ ROOT = SHIPPED_DATA.parent
 
 
 def datasheet() -> str:
-    """One row per shipped dataset: size, episodes, ranges, how it was made, checksum."""
+    """Returns one row for each shipped dataset: its size, episodes, ranges, origin and checksum."""
     rows = []
     for name in shipped_tasks():
         path, data = SHIPPED_DATA / f"{name}.hdf5", load_dataset(name)
@@ -58,7 +59,7 @@ def datasheet() -> str:
 
 
 def frontier() -> str:
-    """The best return at a cost of at most so much, ours against DSRL's."""
+    """Returns the best return of our datasets and of DSRL's at several upper limits of the episode cost."""
     rows = []
     for name in shipped_tasks():
         data, points = load_dataset(name), DSRL_FRONTIER.get(name, {})
@@ -69,7 +70,10 @@ def frontier() -> str:
 
 
 def results_table(results: pd.DataFrame | None = None) -> str:
-    """C2IQL per task: scores per threshold, 95% intervals over seeds; the paper's mean beside ours."""
+    """Returns C2IQL's scores of each task at each threshold, and the means of our runs and of the paper.
+
+    The scores have 95% intervals over seeds.
+    """
     results = load_results("table1") if results is None else results
     rows = []
     for task, part in results[results["algorithm"] == "C2IQL"].groupby("task", sort=False):
@@ -86,7 +90,10 @@ def results_table(results: pd.DataFrame | None = None) -> str:
 
 
 def baselines_table() -> str:
-    """Our algorithms on the paper's tasks, what was not run, and the paper's: mean reward / mean cost."""
+    """Returns mean reward / mean cost of our algorithms and of the paper's, on the paper's tasks.
+
+    The table also names the algorithms that were not run.
+    """
     results = load_results("table1")
     if not len(results):
         return f"*{not_run('table1').capitalize()}.*"
@@ -110,7 +117,8 @@ def baselines_table() -> str:
 
 
 def _pair(reward: float, cost: float) -> str:
-    text = f"{round(reward, 2) + 0:.2f} / {cost:.2f}"  # + 0: no minus before a zero
+    """Returns `reward / cost` with two decimals, in italics where the rounded cost exceeds 1."""
+    text = f"{round(reward, 2) + 0:.2f} / {cost:.2f}"  # + 0 turns -0.0 into 0.0
     return f"*{text}*" if round(cost, 2) > 1 else text
 
 
@@ -118,7 +126,10 @@ def _pair(reward: float, cost: float) -> str:
 
 
 def study_table(results: pd.DataFrame) -> pd.DataFrame:
-    """One row per task and variant: reward / cost at each limit; mean and standard deviation over seeds."""
+    """Returns one row for each task and variant, with reward / cost at each limit.
+
+    The last columns are the means and standard deviations over seeds.
+    """
     by = ["task", "algorithm", *options_of(results)]
     rows = []
     for key, part in results.groupby(by, sort=False, dropna=False):
@@ -140,7 +151,11 @@ def study_table(results: pd.DataFrame) -> pd.DataFrame:
 
 
 def paper_profile_table() -> str:
-    """The runs of profile `paper`, by the updates that they had made, and `small` on the same data."""
+    """Returns the table and the figure of the runs of profile `paper`.
+
+    The table has one row for each variant and number of updates. It also has the runs of profile `small` on
+    the same data.
+    """
     paper, small = load_results("paper-profile"), load_results("table1")
     if not len(paper):
         return "*Not run.*"
@@ -153,7 +168,10 @@ def paper_profile_table() -> str:
 
 
 def write_paper_profile() -> Path | None:
-    """Draw what the critics of profile `paper` come to expect; None where it was not run."""
+    """Draws the costs that the critics of profile `paper` predict during training.
+
+    Returns the file's path, or None where the profile was not run.
+    """
     log = load_results("paper-profile-training")
     if not len(log):
         return None
@@ -164,7 +182,11 @@ def write_paper_profile() -> Path | None:
 
 
 def study_section(name: str) -> str:
-    """A study's question, table, figure and verdicts on the paper's claims, or that it was not run."""
+    """Returns the Markdown section of a study.
+
+    The section has the question, the table, the figure and the verdicts on the paper's claims. Where
+    the study was not run, the section has its question and says that it was not run.
+    """
     results, lines = load_results(name), [f"### {name}", "", get_study(name).question, ""]
     if not len(results):
         return "\n".join([*lines, f"*{not_run(name).capitalize()}.*"])
@@ -178,13 +200,16 @@ def study_section(name: str) -> str:
 
 
 def studies_text() -> str:
-    """Every study's section."""
+    """Returns the Markdown sections of all studies."""
     return "\n\n".join(study_section(name) for name in STUDIES)
 
 
 def write_study(name: str) -> Path | None:
-    """Draw a study's figure beside its results; None where it was not run."""
-    get_study(name)  # raises ValueError where there is none
+    """Draws a study's figure into the folder of its results, and returns the file's path.
+
+    Returns None where the study was not run.
+    """
+    get_study(name)  # raises ValueError for an unknown study
     results = load_results(name)
     if not len(results):
         return None
@@ -195,13 +220,13 @@ def write_study(name: str) -> Path | None:
 
 
 def markdown(table: pd.DataFrame) -> str:
-    """A table in Markdown."""
+    """Returns a table in Markdown."""
     lines = [table.columns, ["---"] * len(table.columns), *table.astype(object).fillna("").astype(str).values]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
 def between_marks(page: str, name: str, text: str) -> str:
-    """`page` with `text` between its marks called `name`. Raises ValueError where it has none."""
+    """Returns `page` with `text` between its marks called `name`. Raises ValueError if a mark is missing."""
     begin, end = f"<!-- {name}:begin -->", f"<!-- {name}:end -->"
     if begin not in page or end not in page:
         raise ValueError(f"the page has no marks {begin} and {end}")
@@ -210,7 +235,7 @@ def between_marks(page: str, name: str, text: str) -> str:
 
 
 def pages() -> dict[Path, str]:
-    """Every page that holds made tables, as it should read now."""
+    """Returns the paths of the pages with tables, and the text that each page must have now."""
     data, readme = SHIPPED_DATA / "README.md", ROOT / "README.md"
     text = data.read_text()
     made = {"datasheet": datasheet, "frontier": frontier, "studies": studies_text}
@@ -225,7 +250,7 @@ def pages() -> dict[Path, str]:
 
 
 def write() -> list[Path]:
-    """Bring the pages, the pictures of the datasets and the studies' figures up to date. Returns them all."""
+    """Writes the pages, the figures of the datasets and the studies' figures, and returns their paths."""
     figures = [path for path in (*map(write_study, STUDIES), write_paper_profile()) if path]
     written = pages()
     for path, text in written.items():
@@ -239,6 +264,7 @@ def write() -> list[Path]:
 
 
 def drawn(figure: Picture, path: Path) -> Path:
+    """Writes the figure to `path` as an image of 256 colours, and returns `path`."""
     with written_whole(path) as temporary:
         temporary.write_bytes(figure.small_png())
     return path

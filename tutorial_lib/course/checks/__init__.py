@@ -1,8 +1,10 @@
-"""Checks that follow a notebook's claims, and checkers for its exercises, one file per notebook.
+"""This package holds the checks of the notebooks' claims and the checkers of their exercises.
 
-A check prints a line without the value that it found, so that a notebook's outputs compare across
-machines; where the claim fails, it raises AssertionError with the value. An exercise's checker never
-raises: it prints what is wrong, or OK.
+There is one file for each notebook; notebooks 09 and 10 share `studies.py`, and all share `checker.py`.
+
+A check prints one line where the claim is true. The line does not show the computed value, so a notebook has
+the same outputs on every machine. A check raises AssertionError with the computed value where the claim is
+false. The checker of an exercise does not raise errors. It prints OK or the first mistake.
 """
 
 from tutorial_lib.course.checks.c2iql import *

@@ -1,4 +1,4 @@
-"""Notebook 08: its exercises."""
+"""This module checks the answers to the exercises of notebook 08."""
 
 from collections.abc import Callable
 
@@ -8,7 +8,10 @@ from tutorial_lib.course.checks.checker import try_answer
 
 
 def check_implicit_cost_value(answer: Callable) -> None:
-    """Notebook 08: `answer(q, v, q_cost, kappa)`, V_c of one state: the cost under the implicit policy."""
+    """Checks an exercise of notebook 08.
+
+    `answer(q, v, q_cost, kappa)` returns V_c of one state, which is the cost under the implicit policy.
+    """
     cost = np.array([0.0, 10.0, 20.0])
     try_answer(
         answer,
@@ -39,7 +42,10 @@ def check_implicit_cost_value(answer: Callable) -> None:
 
 
 def check_condition(answer: Callable) -> None:
-    """Notebook 08: `answer(limit, spent, t, horizon, thresholds)`, the threshold of eq. 23 for a step."""
+    """Checks an exercise of notebook 08.
+
+    `answer(limit, spent, t, horizon, thresholds)` returns the threshold that eq. 23 selects at step t.
+    """
     choices, cases = (30.0, 50.0, 70.0), []
     for limit, spent, t, expected, hint in (
         (30.0, 0.0, 0, 30.0, "at the start nothing is spent: the limit itself"),

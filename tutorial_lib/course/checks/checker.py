@@ -1,4 +1,4 @@
-"""Checks that follow a notebook's claims, and what the checkers of its exercises share."""
+"""This module checks the claims of the notebooks and holds the code that all exercise checkers use."""
 
 from collections.abc import Callable
 
@@ -10,25 +10,29 @@ from tutorial_lib.tasks import Task
 
 
 def check(name: str, value, expected, tolerance: float = 0.0) -> None:
-    """Is `value` within `tolerance` of `expected`? Arrays: everywhere, and of the same shape."""
+    """Checks that `value` differs from `expected` by at most `tolerance`.
+
+    Every element of an array must satisfy this. Two arrays must have the same shape. A scalar `expected` is
+    compared with every element of `value`. Raises AssertionError.
+    """
     value, expected = np.asarray(value, float), np.asarray(expected, float)
     if value.shape != expected.shape and expected.ndim:
         raise AssertionError(f"FAILED  {name}: shape {value.shape}, expected {expected.shape}")
-    close = np.abs(value - expected) <= tolerance  # False where NaN
+    close = np.abs(value - expected) <= tolerance  # a comparison with NaN is False
     if not np.all(close):
         raise AssertionError(f"FAILED  {name} = {text(value)}, expected {text(expected)} +/- {tolerance:g}")
     print(f"OK  {name} = {text(expected)}" + (f" +/- {tolerance:g}" if tolerance else ""))
 
 
 def check_at_most(name: str, value: float, bound: float) -> None:
-    """Is `value` <= `bound`?"""
+    """Checks that `value` is at most `bound`. Raises AssertionError."""
     if not value <= bound:
         raise AssertionError(f"FAILED  {name} = {text(value)}, expected at most {text(bound)}")
     print(f"OK  {name} <= {text(bound)}")
 
 
 def check_that(claim: str, holds) -> None:
-    """Does the claim hold? For an array: everywhere."""
+    """Checks that `holds` is true, and in an array that every element is true. Raises AssertionError."""
     holds = np.asarray(holds)
     if not holds.all():
         where = f" in {np.sum(~holds)} of {holds.size} cases" if holds.ndim else ""
@@ -37,6 +41,7 @@ def check_that(claim: str, holds) -> None:
 
 
 def text(value) -> str:
+    """Returns `value` as the text that a message shows. Numbers have five significant digits."""
     if isinstance(value, torch.Tensor):
         value = value.detach().numpy()
     if isinstance(value, Task):
@@ -50,13 +55,17 @@ def text(value) -> str:
 
 
 def try_answer(answer: Callable, cases) -> None:
-    """Print the first thing that is wrong with `answer`, or OK. A case: arguments, expected value, hint."""
+    """Prints the first mistake of `answer`, or OK.
+
+    Each case is a tuple of the arguments, the expected value and a hint. The hint is printed with a wrong
+    value.
+    """
     for arguments, expected, hint in cases:
         shown = ", ".join(text(argument) for argument in arguments)
         call = f"{answer.__name__}({shown})"
         try:
             got = answer(*arguments)
-        except Exception as error:  # whatever a reader's code may do
+        except Exception as error:  # the reader's code can raise any error
             print(f"NOT YET  {call} raised {type(error).__name__}: {error}")
             return
         if got is None:
@@ -69,7 +78,8 @@ def try_answer(answer: Callable, cases) -> None:
 
 
 def _is_close(got, expected) -> bool:
+    """Returns whether `got` has the shape of `expected` and equal values, up to rounding."""
     try:
         return np.shape(got) == np.shape(expected) and np.allclose(got, expected, atol=1e-6)
-    except (TypeError, ValueError):  # no number
+    except (TypeError, ValueError):  # `got` is not a number
         return False

@@ -1,4 +1,4 @@
-"""Notebook 01: its exercises."""
+"""This module checks the answers to the exercises of notebook 01."""
 
 from collections.abc import Callable
 
@@ -9,7 +9,10 @@ from tutorial_lib.course.tabular import CMDP, least_cost, shortcut
 
 
 def check_run_cost(answer: Callable) -> None:
-    """Notebook 01: `answer(y, speed, speed_limit)`, the cost of a step in a Run task."""
+    """Checks an exercise of notebook 01.
+
+    `answer(y, speed, speed_limit)` returns the cost of a step in a Run task.
+    """
     try_answer(
         answer,
         [
@@ -25,11 +28,11 @@ def check_run_cost(answer: Callable) -> None:
 
 
 def check_least_cost(answer: Callable) -> None:
-    """Notebook 01: `answer(cmdp)`, the least discounted cost that any policy achieves."""
+    """Checks an exercise of notebook 01: `answer(cmdp)` returns the least discounted cost of all policies."""
     stay, swap = np.eye(2), np.eye(2)[::-1]
     zeros, first = np.zeros((2, 2)), np.array([1.0, 0.0])
     one_state = CMDP(np.ones((1, 2, 1)), zeros[:1], np.array([[1.0, 0.25]]), np.ones(1), 0.9)
-    # In state 0 staying costs 0.5 for ever; leaving costs 1 once.
+    # In state 0, the action "stay" costs 0.5 at every step, and the action "swap" costs 1 once.
     patience = CMDP(np.stack([stay, swap], 1), zeros, np.array([[0.5, 1.0], [0.0, 0.0]]), first, 0.9)
     spread = CMDP(np.stack([stay, stay], 1), zeros, np.array([[1.0, 1.0], [0.0, 0.0]]), first / 2 + 0.25, 0.5)
     hints = (

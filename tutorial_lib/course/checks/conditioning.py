@@ -1,4 +1,4 @@
-"""Notebook 07: its exercises."""
+"""This module checks the answers to the exercises of notebook 07."""
 
 from collections.abc import Callable
 
@@ -10,7 +10,7 @@ from tutorial_lib.course.tabular import budget_optimum, random_cmdp
 
 
 def check_rescaled_budget(answer: Callable) -> None:
-    """Notebook 07: `answer(limit, spent, t, horizon)`, eq. 23."""
+    """Checks an exercise of notebook 07: `answer(limit, spent, t, horizon)` returns the value of eq. 23."""
     hints = {
         (30.0, 0.0, 0, 200): "at the start: the limit itself",
         (30.0, 15.0, 100, 200): "half spent at half time: on schedule, the limit itself",
@@ -23,7 +23,11 @@ def check_rescaled_budget(answer: Callable) -> None:
 
 
 def check_budget_backup(answer: Callable) -> None:
-    """Notebook 07: `answer(cmdp, then)`, one step back of the budget recursion, (b+1, S) to (b+1, S)."""
+    """Checks an exercise of notebook 07.
+
+    `answer(cmdp, then)` computes one backward step of the budget recursion. `then` and the result have the
+    shape (b+1, S), where b is the budget and S is the number of states.
+    """
     rng = np.random.default_rng(0)
     cases = []
     for states, budget, hint in (
@@ -38,7 +42,7 @@ def check_budget_backup(answer: Callable) -> None:
 
 
 class _Shown:
-    """A CMDP that a message shows in a word."""
+    """This is a CMDP whose text in a message is only the word `cmdp`."""
 
     def __init__(self, cmdp):
         self.transitions, self.rewards, self.costs = cmdp.transitions, cmdp.rewards, cmdp.costs

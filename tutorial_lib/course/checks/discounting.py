@@ -1,4 +1,4 @@
-"""Notebook 04: its exercises."""
+"""This module checks the answers to the exercises of notebook 04."""
 
 from collections.abc import Callable
 
@@ -9,16 +9,26 @@ from tutorial_lib.course.checks.checker import text, try_answer
 
 
 def check_false_positive(costs, gamma: float = 0.8, limit: float = 3, horizon: int = 10) -> None:
-    """Notebook 04: `costs`, 0 or 1 for each of `horizon` steps: safe, and yet rejected?"""
+    """Checks an exercise of notebook 04: whether an episode with these costs is safe but rejected.
+
+    `costs` holds a cost of 0 or 1 for each of the `horizon` steps.
+    """
     _check_misjudged(costs, gamma, limit, horizon, safe=True)
 
 
 def check_false_negative(costs, gamma: float = 0.8, limit: float = 3, horizon: int = 10) -> None:
-    """Notebook 04: `costs`, 0 or 1 for each of `horizon` steps: unsafe, and yet accepted?"""
+    """Checks an exercise of notebook 04: whether an episode with these costs is unsafe but accepted.
+
+    `costs` holds a cost of 0 or 1 for each of the `horizon` steps.
+    """
     _check_misjudged(costs, gamma, limit, horizon, safe=False)
 
 
 def _check_misjudged(costs, gamma, limit, horizon, safe):
+    """Prints OK where L~ misjudges these costs, and otherwise what is wrong with them.
+
+    The costs must be those of a safe episode where `safe` is true, and of an unsafe episode otherwise.
+    """
     problem = _not_a_sequence(costs, horizon)
     if problem:
         print(f"NOT YET  {problem}")
@@ -42,7 +52,7 @@ def _check_misjudged(costs, gamma, limit, horizon, safe):
 
 
 def _not_a_sequence(costs, horizon) -> str:
-    """What is wrong with `costs` as a sequence of `horizon` zeros and ones, or nothing."""
+    """Returns why `costs` is not a sequence of `horizon` zeros and ones, or an empty text where it is one."""
     if costs is None or costs is ...:
         return f"no costs: write {horizon} zeros and ones in place of the `...`"
     try:
@@ -55,7 +65,11 @@ def _not_a_sequence(costs, horizon) -> str:
 
 
 def check_extremes(answer: Callable) -> None:
-    """Notebook 04: `answer(horizon, gamma, limit)`: the fewest steps that L~ rejects, the most it accepts."""
+    """Checks an exercise of notebook 04.
+
+    `answer(horizon, gamma, limit)` returns two numbers of unsafe steps: the smallest number that L~ can
+    reject and the largest number that it can accept.
+    """
     hints = {
         (10, 0.8, 3): "pack the unsafe steps at the start, then at the end, and compare with L~",
         (4, 0.5, 1): "L~ = 0.469: one step at the start counts 1, the last three together 0.875",

@@ -1,4 +1,4 @@
-"""Notebook 03: its exercises."""
+"""This module checks the answers to the exercises of notebook 03."""
 
 from collections.abc import Callable
 
@@ -8,7 +8,10 @@ from tutorial_lib.course.checks.checker import try_answer
 
 
 def check_expectile(answer: Callable) -> None:
-    """Notebook 03: `answer(values, kappa)`, the expectile of equally frequent values."""
+    """Checks an exercise of notebook 03.
+
+    `answer(values, kappa)` returns the expectile of equally frequent values.
+    """
     try_answer(
         answer,
         [
@@ -24,7 +27,11 @@ def check_expectile(answer: Callable) -> None:
 
 
 def check_linex_weight(answer: Callable) -> None:
-    """Notebook 03: `answer(u, a)`, the weight |f'(u)| / |u| of f(u) = exp(a u) - a u, also at u = 0."""
+    """Checks an exercise of notebook 03.
+
+    `answer(u, a)` returns the weight |f'(u)| / |u| of f(u) = exp(a u) - a u. At u = 0 it returns the value
+    that this ratio approaches.
+    """
     try_answer(
         answer,
         [

@@ -1,4 +1,4 @@
-"""Notebook 06: its exercises."""
+"""This module checks the answers to the exercises of notebook 06."""
 
 from collections.abc import Callable
 
@@ -9,7 +9,7 @@ from tutorial_lib.course.checks.checker import try_answer
 
 
 class _Slope:
-    """The derivative f'(u) of a convex loss, with a name to print."""
+    """This is the derivative f'(u) of a convex loss, whose name is its text in a message."""
 
     def __init__(self, name: str, function: Callable):
         self.name, self.function = name, function
@@ -22,7 +22,11 @@ class _Slope:
 
 
 def check_implicit_policy(answer: Callable) -> None:
-    """Notebook 06: `answer(mu, q, v, slope)`, the implicit policy of Theorem 1: (..., A), v (..., 1)."""
+    """Checks an exercise of notebook 06.
+
+    `answer(mu, q, v, slope)` returns the implicit policy of Theorem 1. `mu`, `q` and the result have the
+    shape (..., A), where A is the number of actions. `v` has the shape (..., 1), or is a number.
+    """
     square = _Slope("2u", lambda u: 2 * u)
     expectile = _Slope("0.7-expectile", lambda u: 2 * np.where(u < 0, 0.3, 0.7) * u)
     linex = _Slope("linex", np.expm1)
@@ -48,7 +52,11 @@ def check_implicit_policy(answer: Callable) -> None:
 
 
 def check_batched_loss(answer: Callable) -> None:
-    """Notebook 06: `answer(weight, q_cost, value)`, eq. 17 for tensors (B,), (B, 1) and (B,)."""
+    """Checks an exercise of notebook 06.
+
+    `answer(weight, q_cost, value)` returns the loss of eq. 17. The tensors have the shapes (B,), (B, 1) and
+    (B,), where B is the number of transitions.
+    """
     rng = np.random.default_rng(0)
     weight, q_cost, value = rng.random(5).round(1), rng.random((5, 1)).round(1), rng.random(5).round(1)
     loop = [w * (q[0] - v) ** 2 for w, q, v in zip(weight, q_cost, value, strict=True)]

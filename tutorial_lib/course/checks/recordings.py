@@ -1,4 +1,4 @@
-"""Notebook 02: its exercises."""
+"""This module checks the answers to the exercises of notebook 02."""
 
 from collections.abc import Callable
 
@@ -8,7 +8,10 @@ from tutorial_lib.course.checks.checker import try_answer
 
 
 def check_episode_sums(answer: Callable) -> None:
-    """Notebook 02: `answer(values, terminals, timeouts)`, one undiscounted sum per whole episode."""
+    """Checks an exercise of notebook 02.
+
+    `answer(values, terminals, timeouts)` returns the undiscounted sum of each complete episode.
+    """
     off = np.zeros(5, bool)
     values = np.array([1.0, 2.0, 4.0, 8.0, 16.0])
     ends = [np.isin(np.arange(5), rows) for rows in ([1, 4], [4], [1], [3])]
@@ -24,7 +27,10 @@ def check_episode_sums(answer: Callable) -> None:
 
 
 def check_backup_target(answer: Callable) -> None:
-    """Notebook 02: `answer(reward, gamma, next_value, terminal, timeout, bootstrap)`, a backup's target."""
+    """Checks an exercise of notebook 02.
+
+    `answer(reward, gamma, next_value, terminal, timeout, bootstrap)` returns the target of a backup.
+    """
     try_answer(
         answer,
         [

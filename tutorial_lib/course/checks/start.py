@@ -1,4 +1,4 @@
-"""Notebook 00: the set-up, and its exercises."""
+"""This module checks the installation and the answers to the exercises of notebook 00."""
 
 import platform
 import sys
@@ -16,7 +16,10 @@ PACKAGES = ("torch", "numpy", "gymnasium", "pybullet", "bullet-safety-gym", "mat
 
 
 def check_setup() -> None:
-    """Python, the packages, and the simulator: does a seed repeat its episode? Prints the versions too."""
+    """Checks Python, the packages and the simulator, and prints the versions.
+
+    The simulator must produce the same episode twice from one seed.
+    """
     check_that("Python 3.11 or newer", sys.version_info >= (3, 11))
     found = {name: _version(name) for name in PACKAGES}
     check_that("all packages are installed", [number is not None for number in found.values()])
@@ -26,6 +29,7 @@ def check_setup() -> None:
 
 
 def _version(name: str) -> str | None:
+    """Returns the version of an installed package, or None where it is not installed."""
     try:
         return version(name)
     except PackageNotFoundError:
@@ -33,6 +37,7 @@ def _version(name: str) -> str | None:
 
 
 def _episode_repeats() -> bool:
+    """Returns whether the simulator produces the same observation after 20 steps from the same seed."""
     from tutorial_lib.tasks import make_env
 
     env = make_env("BallCircle")
@@ -47,7 +52,10 @@ def _episode_repeats() -> bool:
 
 
 def check_keeps_limit(answer: Callable) -> None:
-    """Notebook 00: `answer(costs, limit)`, eq. 1: does a policy with these episode costs keep the limit?"""
+    """Checks an exercise of notebook 00.
+
+    `answer(costs, limit)` returns whether a policy with these episode costs keeps the limit of eq. 1.
+    """
     cases = (
         ([20.0, 10.0, 30.0], True, "no episode exceeds the limit"),
         ([20.0, 35.0, 5.0], True, "eq. 1 bounds the expectation: one episode may cost more"),
@@ -58,7 +66,10 @@ def check_keeps_limit(answer: Callable) -> None:
 
 
 def check_normalised_return(answer: Callable) -> None:
-    """Notebook 00: `answer(total, task)`, DSRL's normalised return, from the task's record."""
+    """Checks an exercise of notebook 00.
+
+    `answer(total, task)` returns DSRL's normalised return. The task's record holds the reference returns.
+    """
     cases = []
     for name, total in (("BallCircle", 0.38312), ("BallCircle", 600.0), ("CarRun", 574.6533)):
         task = get_task(name)

@@ -1,4 +1,4 @@
-"""Notebooks 09 and 10: their exercises."""
+"""This module checks the answers to the exercises of notebooks 09 and 10."""
 
 from collections.abc import Callable
 
@@ -10,7 +10,10 @@ from tutorial_lib.course.checks.checker import try_answer
 
 
 def check_paired_interval(answer: Callable) -> None:
-    """Notebook 09: `answer(first, second)`, the 95% interval of the mean paired difference, (low, high)."""
+    """Checks an exercise of notebook 09.
+
+    `answer(first, second)` returns the 95% interval (low, high) of the mean paired difference.
+    """
     cases = []
     for first, second, hint in (
         ([0.7, 0.8], [0.6, 0.6], "two seeds: t is 12.71 with one degree of freedom, not 1.96"),
@@ -29,7 +32,11 @@ def check_paired_interval(answer: Callable) -> None:
 
 
 def check_best_safe(answer: Callable) -> None:
-    """Notebook 09: `answer(rewards, costs)`, the setting of most reward whose cost is at most 1, or -1."""
+    """Checks an exercise of notebook 09.
+
+    `answer(rewards, costs)` returns the index of the setting that has the highest reward among those with a
+    cost of at most 1. It returns -1 where no setting has such a cost.
+    """
     cases = []
     for rewards, costs, expected, hint in (
         ([0.5, 0.9, 0.7], [0.4, 0.8, 0.9], 1, "all are safe: the one that earns the most"),
@@ -43,7 +50,11 @@ def check_best_safe(answer: Callable) -> None:
 
 
 def check_seed_spread(answer: Callable) -> None:
-    """Notebook 10: `answer(scores)`, standard deviation over seeds of the mean over limits and episodes."""
+    """Checks an exercise of notebook 10.
+
+    `answer(scores)` returns the standard deviation over seeds. The score of a seed is the mean over its
+    episodes at each limit, then the mean over the limits.
+    """
     cases = []
     for values, expected, hint in (
         ({(0, 30): [1, 1], (1, 30): [3, 3]}, 2**0.5, "two seeds with means 1 and 3: divide by n - 1"),
@@ -70,7 +81,11 @@ def check_seed_spread(answer: Callable) -> None:
 
 
 def check_share_kept(answer: Callable) -> None:
-    """Notebook 10: `answer(costs, limits)`, the share of mean costs (A, limits) that keep their limit."""
+    """Checks an exercise of notebook 10.
+
+    `answer(costs, limits)` returns the share of mean costs that are at most their limit. `costs` has one row
+    for each agent and one column for each limit.
+    """
     limits = np.array([30.0, 50.0, 70.0])
     cases = []
     for costs, expected, hint in (

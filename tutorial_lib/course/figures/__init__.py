@@ -1,5 +1,7 @@
-"""The course's figures: each function draws one and returns it, closed, so that a notebook shows it once,
-where it is the last value of a cell. One file per idea of the course.
+"""The figures of the course, one file for each topic.
+
+Each function draws one figure, closes it and returns it. A notebook therefore shows it once, where it is the
+last value of a cell.
 """
 
 from tutorial_lib.course.figures.cmdp import *

@@ -1,4 +1,4 @@
-"""The eight tasks from their cameras, drives from above, and the shortcut: its map, policies and frontier."""
+"""The figures of the CMDP: the tasks, whole episodes and the shortcut grid."""
 
 import functools
 
@@ -16,10 +16,10 @@ from tutorial_lib.tasks import TASKS, Task, make_env, scene_of
 
 @one_figure
 def all_tasks(seed: int = 0, size=(320, 240), family: str = "bullet"):
-    """The tasks of a family, as the camera sees the start of an episode, by scene and by robot.
+    """Draws the first camera image of every task of a family, with a row per scene and a column per robot.
 
-    A ring shows where a robot is that is seen from afar. Tasks without a scene are left out. Raises
-    ValueError where no task is left.
+    Where the camera of the scene is far away, a ring marks the robot. Tasks without a scene are left out. The
+    function raises ValueError if no task is left.
     """
     shown = [task for task in TASKS.values() if task.family == family and task.scene is not None]
     if not shown:
@@ -48,9 +48,10 @@ def all_tasks(seed: int = 0, size=(320, 240), family: str = "bullet"):
 
 @one_figure
 def drives(task: Task, episodes: dict):
-    """Whole episodes from above, with the cost zone, by title, in panels as the task's scene suggests.
+    """Draws whole episodes from above, with the cost zone, in one panel per title.
 
-    Each has rewards (T,), costs (T,) and positions (T, 2).
+    `episodes` maps a title to an episode with rewards (T,), costs (T,) and positions (T, 2). The task's scene
+    sets the layout of the panels.
     """
     scene = scene_of(task)
     shape, size = scene.layout(len(episodes))
@@ -69,11 +70,14 @@ def drives(task: Task, episodes: dict):
 
 @one_figure
 def trade_off(costs, returns, labels, words: str):
-    """One dot per way of driving, by its cost and its return, joined in order and labelled."""
+    """Draws one labelled dot per way of driving, at its cost and its return.
+
+    A line joins the dots in the order in which they are given.
+    """
     figure, ax = subplots(figsize=(9, 4.6))
     ax.plot(costs, returns, "o-", color=NEUTRAL, markersize=9, linewidth=1.5, markerfacecolor=REWARD)
     falls = np.append(np.diff(returns) < 0, False)
-    falls[-1] = falls[-2]  # a label stands below its dot where the line rises, above where it falls
+    falls[-1] = falls[-2]  # A label is above its dot where the line falls, and otherwise below it.
     for x, y, label, above in zip(costs, returns, labels, falls, strict=True):
         ax.annotate(f"{label}", (x, y), textcoords="offset points", xytext=(8, 6 if above else -14))
     ax.set(xlabel="cost of the episode", ylabel="return of the episode", title=words)
@@ -83,18 +87,21 @@ def trade_off(costs, returns, labels, words: str):
 
 # --- The shortcut ---
 
-_STEPS = ((0, 1), (1, 0), (0, -1), (-1, 0))  # up, right, down, left, on paper
+_STEPS = ((0, 1), (1, 0), (0, -1), (-1, 0))  # These are up, right, down and left in the plot.
 _WAYS = {"straight on": ("→→→→", 0.14), "over": ("↑→→→→↓", 0.0), "around": ("↑↑→→→→↓↓", -0.14)}
 
 
 def _places(layout):
-    """The middle of each cell on paper, (S, 2), first row on top."""
+    """Returns the centre of each cell in plot coordinates, (S, 2). The first row is at the top."""
     rows, columns = len(layout), len(layout[0])
     return np.array([(c, rows - 1 - r) for r in range(rows) for c in range(columns)], float)
 
 
 def _draw_grid(ax, shade=None, layout=tabular.SHORTCUT):
-    """Cells, shaded between 0 and 1; hazards framed; S and G."""
+    """Draws the cells of the grid, shaded by values in [0, 1].
+
+    Hazards have a hatched frame. The letters S and G mark the start and the goal.
+    """
     shade = np.zeros(len(layout) * len(layout[0])) if shade is None else np.clip(shade, 0, 1)
     for kind, (x, y), dark in zip("".join(layout), _places(layout), shade, strict=True):
         ax.add_patch(Rectangle((x - 0.5, y - 0.5), 1, 1, color=str(1 - 0.45 * dark), linewidth=0))
@@ -113,7 +120,11 @@ def _draw_grid(ax, shade=None, layout=tabular.SHORTCUT):
 
 
 def _draw_policy(ax, policy, shown, layout=tabular.SHORTCUT):
-    """An arrow per action as long as its probability, in the cells that are `shown`."""
+    """Draws an arrow for each action in the cells that are `shown`.
+
+    The length of an arrow grows with the probability of its action. Actions with a probability of at most
+    0.02 get no arrow.
+    """
     for state, (x, y) in enumerate(_places(layout)):
         if not shown[state] or "".join(layout)[state] == "G":
             continue
@@ -127,7 +138,7 @@ def _draw_policy(ax, policy, shown, layout=tabular.SHORTCUT):
 
 @one_figure
 def shortcut_map():
-    """The map with its three ways: steps and hazards of each."""
+    """Draws the shortcut grid with its three ways, and names the steps and the hazards of each way."""
     figure, ax = subplots(figsize=(9, 4.6))
     _draw_grid(ax)
     places = _places(tabular.SHORTCUT)
@@ -148,7 +159,11 @@ def _cell(place):
 
 @one_figure
 def shortcut_under_limit(limit: float):
-    """The shortcut's Pareto frontier with the limit's place on it; the best policy and where it goes."""
+    """Draws the shortcut's Pareto frontier and the best policy under the limit.
+
+    The left panel marks the limit on the frontier. The right panel shows the policy, and cells are darker
+    where it goes more often.
+    """
     cost, reward = _frontier()
     figure, (left, right) = subplots(1, 2, figsize=(12, 4.6), width_ratios=(5, 6))
     left.plot(cost, reward, color=REWARD, label="the best reward under each limit")
@@ -183,9 +198,13 @@ def _frontier():
 
 @one_figure
 def episode_costs(panels: dict, limit: float):
-    """How often an episode costs how much, by title; the limit dashed, the mean a diamond."""
+    """Draws the share of episodes at each cost, in one panel per title.
+
+    The dashed line is the limit, and the diamond is the mean cost.
+    """
     figure, axes = subplots(1, len(panels), figsize=(12, 4.2), sharex=True, sharey=True, squeeze=False)
-    top = int(max(np.ceil(np.quantile(costs, 0.998)) for costs in panels.values()))  # no empty tail
+    # The quantile cuts the empty tail.
+    top = int(max(np.ceil(np.quantile(costs, 0.998)) for costs in panels.values()))
     length = int(max(np.max(costs) for costs in panels.values())) + 1
     for ax, (title, costs) in zip(axes[0], panels.items(), strict=True):
         share = np.bincount(np.asarray(costs, int), minlength=length) / len(costs)

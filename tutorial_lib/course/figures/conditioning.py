@@ -1,4 +1,4 @@
-"""The budget rule: what is told at which step after which cost, and how near it comes to the optimum."""
+"""The figures of the budget rule (eq. 23): the limits it gives the agent, and the distance to the optimum."""
 
 import numpy as np
 from matplotlib.colors import BoundaryNorm, ListedColormap
@@ -11,13 +11,15 @@ _SHADES = ["#F4F8FB", "#D9E8F3", "#B5D3E7", "#7FB2D6", "#3F8BC0"]
 
 @one_figure
 def budget_maps(panels: dict, limits):
-    """What is told (shades) at each step after each cost so far, and what is spent; a panel per limit.
+    """Draws the limit that the agent is given at each step and cost so far, with one panel per limit.
 
-    `panels`: by title, told thresholds (T, C) and the chances of what is spent (T+1, C), or None.
+    A darker shade means a higher given limit. `panels` maps a title to a pair: the given limits (T, C), and
+    the probabilities of the cost so far (T+1, C) or None. With probabilities, the panel also shows the median
+    and the central 80% of the cost so far.
     """
     choices = np.unique(np.concatenate([told.ravel() for told, _ in panels.values()]))
     shades = np.linspace(0, len(_SHADES) - 1, len(choices)).round().astype(int)
-    colours = ListedColormap([_SHADES[shade] for shade in shades])  # the more is told, the darker
+    colours = ListedColormap([_SHADES[shade] for shade in shades])  # A higher limit is darker.
     norm = BoundaryNorm(np.arange(len(choices) + 1) - 0.5, len(choices))
     figure, axes = subplots(1, len(panels), figsize=(12, 4.8), sharey=True, squeeze=False)
     top = 1.25 * max(limits)
@@ -49,9 +51,10 @@ def _draw_spending(ax, chances):
 
 @one_figure
 def against_optimum(limits, curves: dict, thresholds=()):
-    """Expected return and cost under each limit. `curves`: by name, returns and costs, each like `limits`.
+    """Draws the expected return and the expected cost under each limit.
 
-    The first is the measure of the others: a broad pale line. Thresholds are ticks at the bottom.
+    `curves` maps a name to returns and costs, each as long as `limits`. The first curve is the reference for
+    the others, and it is a broad pale line. The `thresholds` are triangles at the bottom.
     """
     figure, axes = subplots(1, 2, figsize=(12, 4.8))
     looks: list[dict] = [dict(color=REWARD, alpha=0.35, linewidth=9), dict(color=LIMIT, linestyle=":"),
@@ -74,9 +77,11 @@ def against_optimum(limits, curves: dict, thresholds=()):
 
 @one_figure
 def with_and_without_rule(limits, agents: dict):
-    """Expected cost of each agent under each limit: told the limit once, and told what is left of it.
+    """Draws the expected cost of each agent under each limit, without and with the budget rule.
 
-    `agents`: by title, the costs without and with the rule, each like `limits`.
+    Without the rule the agent is given the limit once, at the start. With the rule it is given what is left
+    of the limit at every step. `agents` maps a title to the costs without and with the rule, each as long as
+    `limits`.
     """
     figure, axes = subplots(1, len(agents), figsize=(12, 4.4), sharey=True, squeeze=False)
     for ax, (title, (without, with_rule)) in zip(axes[0], agents.items(), strict=True):

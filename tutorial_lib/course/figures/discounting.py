@@ -1,4 +1,4 @@
-"""When costs fall and what discounting makes of them: timelines, Fig. 1, and the price of a long memory."""
+"""The figures of discounted costs: timelines, Fig. 1, and the updates that a large gamma needs."""
 
 import numpy as np
 from matplotlib.colors import to_rgba
@@ -22,10 +22,10 @@ COLOURS = {FALSE_POSITIVE: REWARD, FALSE_NEGATIVE: COST}
 
 @one_figure
 def timelines(costs, gamma: float, limit: float, names=None):
-    """Sequences of costs (n, T), one above the other, and what eq. 1 and eq. 2 say of each.
+    """Draws sequences of costs (n, T) in rows, and compares eq. 1 and eq. 2 for each of them.
 
-    Left, every unsafe step, the paler the less it counts; right, cost and discounted cost in units of
-    their limits, L and L~.
+    The left panel shows every unsafe step, and a step is paler where its weight is smaller. The right panel
+    shows the cost in units of its limit L, and the discounted cost in units of its limit L~.
     """
     costs = np.atleast_2d(costs)
     count, horizon = costs.shape
@@ -54,7 +54,7 @@ def timelines(costs, gamma: float, limit: float, names=None):
 
 
 def _draw_steps(ax, row: int, costs, gamma: float):
-    """A grey band per sequence and its unsafe steps on it, coloured by their weight gamma^t."""
+    """Draws one sequence as a grey band, with its unsafe steps coloured by their weight gamma^t."""
     horizon = len(costs)
     ax.barh(row, horizon, 0.62, color=NEUTRAL, alpha=0.15)
     unsafe = np.flatnonzero(costs)
@@ -64,10 +64,10 @@ def _draw_steps(ax, row: int, costs, gamma: float):
 
 @one_figure
 def falling_cost(gamma: float, start: int, horizon: int = 301, limit: float = 50, lengths=(40, 60)):
-    """Blocks of unsafe steps, one shorter and one longer than the limit, that both begin at `start`.
+    """Draws two blocks of unsafe steps, one shorter and one longer than the limit, that begin at `start`.
 
-    Above, the blocks and the weight gamma^t of a step; below, for every start, their discounted cost in
-    units of L~, with the stretches where it misjudges them.
+    The upper panel shows the blocks and the weight gamma^t of a step. The lower panel shows their discounted
+    cost for every start, in units of L~. The line is thick where the discounted cost misjudges the block.
     """
     time, mark = np.arange(horizon), average_threshold(limit, gamma, horizon)
     figure, (above, below) = subplots(2, 1, figsize=(12, 6), height_ratios=(2, 3), sharex=True)
@@ -95,9 +95,10 @@ def falling_cost(gamma: float, start: int, horizon: int = 301, limit: float = 50
 
 @one_figure
 def mismatch(panels, ylabel: str = r"discounted cost $\tilde C$"):
-    """Fig. 1: a dot per sequence, its cost and an estimate of it; what the estimate misjudges stands out.
+    """Draws the paper's Fig. 1: a dot per sequence, at its cost and an estimate of its cost.
 
-    `panels` maps a title to (costs (n,), estimates (n,), limit of the costs, limit of the estimates).
+    Sequences that the estimate misjudges are coloured. `panels` maps a title to (costs (n,), estimates (n,),
+    limit of the costs, limit of the estimates).
     """
     figure, axes = task_panels(panels, 4.6)
     for ax, (title, panel) in zip(axes.flat, panels.items(), strict=False):
@@ -117,7 +118,7 @@ def _draw_mismatch(ax, title, cost, estimate, limit, mark):
     for kind, here in (("judged right", right), *kinds):
         colour = COLOURS.get(kind, NEUTRAL)
         ax.plot(cost[here], estimate[here], color=colour, **dots)
-        ax.plot([], [], "o", color=colour, markersize=9, label=kind)  # the legend's, to be seen
+        ax.plot([], [], "o", color=colour, markersize=9, label=kind)  # This is a larger dot for the legend.
     ax.axvline(limit, **DASHED, label="limits")
     ax.axhline(mark, **DASHED)
     ax.set(xlabel="cost $C$", xlim=(0, None), ylim=(0, None))
@@ -130,10 +131,10 @@ def _draw_mismatch(ax, title, cost, estimate, limit, mark):
 
 @one_figure
 def misjudged_shares(counts):
-    """Shares of a dataset's episodes that eq. 2 misjudges, a panel per task.
+    """Draws the shares of a dataset's episodes that eq. 2 misjudges, with one panel per task.
 
-    `counts` maps a task to {limit: (false positives, false negatives)} as shares; blue bars hang, vermilion
-    ones stand.
+    `counts` maps a task to {limit: (false positives, false negatives)}, and both values are shares. Blue bars
+    are false positives. Vermilion bars are false negatives.
     """
     figure, axes = task_panels(counts, 3.9, sharey=True)
     for ax, limits in zip(axes.flat, counts.values(), strict=False):
@@ -151,10 +152,11 @@ def misjudged_shares(counts):
 
 @one_figure
 def long_memory(gammas, shares, updates, marked=(), available: float = 400_000):
-    """What a longer memory buys and what it costs, over the horizon 1 / (1 - gamma).
+    """Draws the share of misjudged sequences and the updates of a critic over the horizon 1 / (1 - gamma).
 
-    `shares` maps a name to the shares of sequences misjudged at each gamma (n,); `updates` (n,) are those
-    until a critic has settled; `marked` are gammas to point out, `available` a budget of updates.
+    `shares` maps a name to the shares of sequences misjudged at each gamma (n,). `updates` (n,) holds the
+    number of updates until a critic has settled. The gammas in `marked` are labelled. `available` is the
+    number of updates in a run, and a dotted line shows it.
     """
     memory = 1 / (1 - np.asarray(gammas))
     figure, (left, right) = subplots(1, 2, figsize=(12, 4.6))

@@ -1,4 +1,4 @@
-"""The robot in the simulator: from its camera, from above, and step by step."""
+"""The figures of single episodes: camera images, the path from above, and the cost at each step."""
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -21,10 +21,10 @@ from tutorial_lib.tasks import Task, make_env, scene_of
 
 
 def film(agent, limit: float, seed: int, steps, image_size=(360, 270), run: int = 0):
-    """Pictures of one episode under `limit`, one at each of `steps`; and the cost so far at each of them.
+    """Returns camera images of one episode under `limit`, and the cost so far, at each of `steps`.
 
-    The simulator draws a red sphere around a robot whose last step was unsafe. Returns uint8 (frames,
-    height, width, 3) and costs (frames,).
+    The images are uint8 (frames, height, width, 3), and the costs are (frames,). The simulator draws a red
+    sphere around the robot if its last step was unsafe.
     """
     env = make_env(agent.task, render_mode="rgb_array", image_size=image_size)
     player = agent.player([limit], [seed], run)
@@ -44,7 +44,11 @@ def film(agent, limit: float, seed: int, steps, image_size=(360, 270), run: int 
 
 
 def multiple_exposure(frames: np.ndarray) -> np.ndarray:
-    """One picture from the frames of a still camera: the scene once, what moved every time, older paler."""
+    """Returns one image that combines the frames of a fixed camera.
+
+    The background is the median of the frames. Moving parts appear once per frame, and they are paler in
+    older frames.
+    """
     scene = np.median(frames, axis=0)
     picture = scene.copy()
     for frame, strength in zip(frames, np.linspace(0.45, 1.0, len(frames)), strict=True):
@@ -55,10 +59,13 @@ def multiple_exposure(frames: np.ndarray) -> np.ndarray:
 
 @one_figure
 def robot_at_limits(agent, limits=None, seed: int = 10):
-    """The same start under each limit (default: the task's own): the robot at several steps at once."""
+    """Draws one episode per limit from the same start, with the robot at several steps in one image.
+
+    The default limits are the task's thresholds.
+    """
     task = agent.task
     limits = task.thresholds if limits is None else limits
-    steps = range(task.horizon // 3, task.horizon // 3 + 36, 3)  # a Ball's or a Car's lap, about
+    steps = range(task.horizon // 3, task.horizon // 3 + 36, 3)  # This is about one lap of a Ball or a Car.
     played = rollout(agent, limits, [seed] * len(limits))
     figure, axes = subplots(1, len(limits), figsize=(3.6 * len(limits), 3.5), squeeze=False)
     for e, (ax, limit) in enumerate(zip(axes[0], limits, strict=True)):
@@ -73,7 +80,7 @@ def robot_at_limits(agent, limits=None, seed: int = 10):
 
 @one_figure
 def frames_strip(frames, costs, steps, limit: float):
-    """Frames of an episode side by side, each with its step and the cost so far."""
+    """Draws frames of an episode side by side, each with its step and the cost so far."""
     figure, axes = subplots(1, len(frames), figsize=(12, 12 / len(frames)), squeeze=False)
     for ax, frame, cost, step in zip(axes[0], frames, costs, steps, strict=True):
         ax.imshow(frame)
@@ -88,7 +95,7 @@ def frames_strip(frames, costs, steps, limit: float):
 
 @one_figure
 def paths(played: Rollout, task: Task, limits):
-    """Each episode of a rollout from above: where the robot was, where that was unsafe, the cost zone."""
+    """Draws each episode of a rollout from above: the robot's path, its unsafe steps, and the cost zone."""
     shape, size = scene_of(task).layout(len(limits), wide_panel=(11, 2.6))
     figure, axes = subplots(*shape, figsize=size, sharex=True, sharey=True, squeeze=False)
     for e, (ax, limit) in enumerate(zip(axes.flat, limits, strict=True)):
@@ -101,7 +108,10 @@ def paths(played: Rollout, task: Task, limits):
 
 @one_figure
 def budget(played: Rollout, task: Task, limits):
-    """Each episode of a rollout: the cost so far against its limit; below, the threshold given (eq. 23)."""
+    """Draws the cost so far of each episode of a rollout, and the limit given at each step (eq. 23).
+
+    The upper row shows the cost so far and the episode's limit. The lower row shows the given limit.
+    """
     count = len(limits)
     figure, axes = subplots(
         2, count, figsize=(4 * count, 6), sharex=True, sharey="row", squeeze=False, height_ratios=(3, 2)
@@ -119,7 +129,7 @@ def budget(played: Rollout, task: Task, limits):
 
 @one_figure
 def episode(played: Rollout, task: Task, limit: float, e: int = 0):
-    """One episode: from above, its cost so far against the limit, and the threshold given at each step."""
+    """Draws one episode: its path from above, its cost so far, and the limit given at each step."""
     figure, axes = plt.subplot_mosaic(
         [["path", "cost"], ["path", "condition"]],
         figsize=(12, 6),

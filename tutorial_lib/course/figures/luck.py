@@ -1,4 +1,4 @@
-"""Luck: what intervals over episodes and picked checkpoints make of runs that do not differ at all."""
+"""The figures of chance: intervals over episodes, and selected checkpoints, of runs that do not differ."""
 
 import numpy as np
 from matplotlib import ticker
@@ -25,10 +25,11 @@ STUDIES, EPISODES, EPISODE_SPREAD = 20, 30, 0.05
 
 
 def simulated_intervals(seeds: int, spread: float, studies: int = STUDIES, rng=None):
-    """Intervals (studies, 2) of a true difference of zero: with episodes as the unit, with seeds as the unit.
+    """Returns two sets of intervals (studies, 2) of a true difference of zero.
 
-    Every study has two variants of `seeds` runs, whose skill varies with standard deviation `spread`; each
-    run plays 30 episodes, which vary by 0.05.
+    The unit of the first set is the episode, and the unit of the second set is the seed. Every study compares
+    two variants of `seeds` runs. The true score of a run varies with standard deviation `spread`. Each run
+    plays 30 episodes, whose scores vary with standard deviation 0.05.
     """
     rng = np.random.default_rng(0) if rng is None else rng
     skill = rng.normal(0, spread, (studies, 2, seeds, 1))
@@ -43,7 +44,10 @@ def simulated_intervals(seeds: int, spread: float, studies: int = STUDIES, rng=N
 
 @one_figure
 def false_alarms(seeds: int = 3, spread: float = 0.05):
-    """Twenty studies of two variants that are equal: which intervals claim a difference?"""
+    """Draws the intervals of twenty studies of two equal variants, and marks those that exclude zero.
+
+    The left panel uses the episode as the unit, and the right panel uses the seed.
+    """
     figure, axes = subplots(1, 2, figsize=(12, 4.6), sharey=True)
     intervals = simulated_intervals(seeds, spread)
     for ax, found, unit in zip(axes, intervals, ("episode", "seed"), strict=True):
@@ -62,14 +66,17 @@ def false_alarms(seeds: int = 3, spread: float = 0.05):
 
 
 def picked_checkpoints(checkpoints: int, episodes: int, runs: int = 2_000) -> np.ndarray:
-    """Evaluations (runs, checkpoints) of agents whose true score is 0.7 at all times."""
+    """Returns evaluations (runs, checkpoints) of agents whose true score is 0.7 at every checkpoint."""
     rng = np.random.default_rng(0)
     return 0.7 + rng.normal(0, 0.15 / episodes**0.5, (runs, checkpoints))
 
 
 @one_figure
 def lucky_checkpoints(checkpoints: int = 20, episodes: int = 5):
-    """One run's evaluations, and what is reported on average: the last checkpoint, or the best seen."""
+    """Draws the evaluations of one run, and the reported score over many runs.
+
+    The right panel compares the score of the last checkpoint with the score of the best checkpoint.
+    """
     scores = picked_checkpoints(checkpoints, episodes)
     figure, axes = subplots(1, 2, figsize=(12, 4.4), sharey=True)
     axes[0].plot(range(1, checkpoints + 1), scores[0], "o-", color=NEUTRAL, linewidth=1.5, label="evaluation")
@@ -93,9 +100,9 @@ def lucky_checkpoints(checkpoints: int = 20, episodes: int = 5):
 
 @one_figure
 def room_left(results):
-    """Per task and limit: the best recorded episode within the limit, and what the algorithms earn there.
+    """Draws the best recorded return within each limit and the algorithms' mean returns, per task.
 
-    A hollow mark breaks its limit: what it earns does not count.
+    A hollow mark means that the mean cost is above the limit, so this return does not count.
     """
     scored = with_scores(results)
     tasks = list(scored["task"].unique())

@@ -1,4 +1,4 @@
-"""Notebook 03: what a maximum promises, expectiles, and implicit policies."""
+"""The figures of notebook 03: the bias of a maximum, expectiles, and implicit policies."""
 
 import numpy as np
 from matplotlib import ticker
@@ -12,7 +12,11 @@ STAR = {"marker": "*", "markersize": 20, "linestyle": "none", "color": COST, "ma
 
 @one_figure
 def two_maxima(seed: int = 0, arms: int = 20, degree: int = 2):
-    """Two bandits: equally good actions with noisy estimates; one action, and fits of narrow recordings."""
+    """Draws two bandits in which the maximum of the estimates is too high.
+
+    The first bandit has equally good actions with noisy estimates. The second has one continuous action, and
+    the figure shows fits to recordings that cover a narrow range of it.
+    """
     rng = np.random.default_rng(seed)
     figure, (noise, support) = subplots(1, 2, figsize=(12, 4.8), width_ratios=(2, 3))
     estimates = rng.normal(size=arms)
@@ -40,10 +44,11 @@ def two_maxima(seed: int = 0, arms: int = 20, degree: int = 2):
 
 @one_figure
 def courses(panels: dict):
-    """How values went, a panel each: {title: ({label: maximisation_bias.Course}, achieved, ceiling)}, on a
-    log scale.
+    """Draws the mean Q of recorded actions over the updates, on a log scale, with one panel per title.
 
-    The label "maximum" is orange; dashed lines show what was achieved and what no policy can exceed.
+    `panels` is {title: ({label: maximisation_bias.Course}, achieved, ceiling)}. The curve with the label
+    "maximum" is orange. Dashed lines show the value that was achieved and the value that no policy can
+    exceed.
     """
     figure, axes = subplots(1, len(panels), figsize=(12, 5.4), sharey=True, squeeze=False)
     for ax, (title, (found, achieved, ceiling)) in zip(axes[0], panels.items(), strict=True):
@@ -68,7 +73,10 @@ def courses(panels: dict):
 
 @one_figure
 def expectile_of(values, kappa: float):
-    """A distribution of Q (n,), its kappa-expectile, the weight on either side; and all its expectiles."""
+    """Draws a distribution of Q (n,) with its kappa-expectile, and the expectile for every kappa.
+
+    The left panel also names the weight of the values on each side of the expectile.
+    """
     values = np.asarray(values, float)[None]
     mu = np.full(values.shape, 1 / values.size)
     level = expectile(mu, values, kappa)[0]
@@ -99,9 +107,10 @@ def expectile_of(values, kappa: float):
 
 @one_figure
 def implicit_policies(actions, mu, q, found: dict):
-    """Implicit policies over one continuous action, {name: (V, policy)}; Q and V above, policies below.
+    """Draws implicit policies over one continuous action, with Q and V above and the policies below.
 
-    actions, mu, q and each policy are (n,); the first two curves of a column share its action axis.
+    `found` is {name: (V, policy)}. The arrays actions, mu, q and each policy are (n,). The two panels of a
+    column share the action axis.
     """
     figure, axes = subplots(2, len(found), figsize=(12, 6), sharex=True, sharey="row", squeeze=False)
     for (above, below), (name, (v, policy)) in zip(axes.T, found.items(), strict=True):
@@ -120,7 +129,10 @@ def implicit_policies(actions, mu, q, found: dict):
 
 @one_figure
 def towards_the_maximum(kappas, values, levels: dict):
-    """V of the start, (k,), as kappa nears 1, on a scale of 1 - kappa; lines at named levels."""
+    """Draws V of the start state, (k,), over 1 - kappa, as kappa approaches 1.
+
+    `levels` maps a name to a value, and a dashed line shows each value.
+    """
     figure, ax = subplots(figsize=(11, 4.6))
     ax.plot(1 - np.asarray(kappas), values, "o-", color=REWARD, label="V of IQL")
     for level, (words, colour) in zip(

@@ -1,4 +1,4 @@
-"""Penalties and implicit policies: who is asked outside the data, and what a limit does to one state."""
+"""The figures of penalties and implicit policies: critics outside the data, and the effect of a limit."""
 
 import numpy as np
 
@@ -8,9 +8,10 @@ from tutorial_lib.style import COST, DASHED, LIMIT, NEUTRAL, REWARD, legend_belo
 
 @one_figure
 def outside_data(grid, estimates, truth, recorded, limit: float):
-    """Costs that k critics (k, G) expect of the actions on `grid` (G,), beside the truth (G,).
+    """Draws the costs (k, G) that k critics predict for the actions on `grid` (G,), beside the truth (G,).
 
-    Left, every critic, with the recorded actions below; right, the share of critics that call an action safe.
+    The left panel shows every critic, and the range of the recorded actions is grey. The right panel shows
+    the share of critics that call an action safe.
     """
     grid, estimates, truth, recorded = (np.asarray(x) for x in (grid, estimates, truth, recorded))
     figure, (left, right) = subplots(1, 2, figsize=(12, 4.6))
@@ -32,9 +33,10 @@ def outside_data(grid, estimates, truth, recorded, limit: float):
 
 @one_figure
 def ood_detector(divergences: dict):
-    """What a VAE's encoder says of recorded and of random actions: {task: (recorded, random)}, both (n,).
+    """Draws the KL divergences of a VAE's encoder for recorded and for random actions.
 
-    The dashed line leaves a quarter of both to its right: what CPQ would call outside, if it had them.
+    `divergences` is {task: (recorded, random)}, and both arrays are (n,). A quarter of all these actions lie
+    to the right of the dashed line. CPQ would call this quarter out of distribution if it had these actions.
     """
     figure, axes = subplots(1, len(divergences), figsize=(12, 4.4), squeeze=False)
     for ax, (name, (recorded, random)) in zip(axes[0], divergences.items(), strict=True):
@@ -50,7 +52,10 @@ def ood_detector(divergences: dict):
 
 @one_figure
 def against_truth(truth, values: dict):
-    """Values by some formulas, {label: (n,)}, against the truth (n,): right is on the diagonal."""
+    """Draws values by some formulas, {label: (n,)}, against the true values (n,).
+
+    A correct value lies on the diagonal.
+    """
     figure, ax = subplots(figsize=(8, 5))
     end = 1.05 * np.max(truth)
     ax.plot([0, end], [0, end], color=NEUTRAL, linewidth=1.5, label="right")
@@ -64,7 +69,7 @@ def against_truth(truth, values: dict):
 
 @one_figure
 def values_by_state(values: dict):
-    """A value for every state, {label: (S,)}, as rows of markers."""
+    """Draws a value for every state, {label: (S,)}, with a different marker for each label."""
     figure, ax = subplots(figsize=(12, 4))
     styles = zip(values.items(), (LIMIT, REWARD, COST), ("D", "o", "_"), (11, 9, 26), strict=False)
     for (label, row), colour, marker, size in styles:
@@ -78,9 +83,10 @@ def values_by_state(values: dict):
 
 @one_figure
 def cost_of_limits(limits, costs: dict):
-    """What implicit policies cost, {label: (n,)}, that were trained for each of `limits` (n,).
+    """Draws the costs of implicit policies, {label: (n,)}, that were trained for each of `limits` (n,).
 
-    NaN where the iteration did not settle: the line has a gap there. Below the dashed line the limit is kept.
+    A NaN means that the iteration did not settle, and the line has a gap there. A policy below the dashed
+    line keeps its limit.
     """
     figure, ax = subplots(figsize=(11, 4.8))
     ax.plot([0, limits[-1]], [0, limits[-1]], **DASHED, label="cost = limit")
@@ -95,9 +101,10 @@ def cost_of_limits(limits, costs: dict):
 
 @one_figure
 def penalised_state(q_reward, q_cost, behaviour, limit: float, kappa: float):
-    """Eqs. 11 to 17 in one state with A actions, all (A,): the penalty, V_r, and the implicit policy.
+    """Draws eqs. 11 to 17 in one state with A actions: the penalty, V_r and the implicit policy.
 
-    Raises ValueError unless kappa lies within (0, 1).
+    The arrays q_reward, q_cost and behaviour are (A,). The function raises ValueError unless kappa lies
+    within (0, 1).
     """
     if not 0 < kappa < 1:
         raise ValueError(f"kappa must lie in (0, 1), not {kappa}")

@@ -1,4 +1,6 @@
-"""Undoing discounts: the weights that flatten them, and what noise, size, time limits and lag do to it."""
+"""The figures of cost reconstruction: the weights of the heads, and the effects of noise, model size, time
+limits and critics that have not settled.
+"""
 
 import numpy as np
 import torch
@@ -8,12 +10,15 @@ from tutorial_lib.course.undiscounting import cost_bounds, head_bounds, steady_h
 from tutorial_lib.style import COST, DASHED, LIMIT, NEUTRAL, REWARD, legend_below, one_figure, subplots
 from tutorial_lib.tasks import Task
 
-GREEN, PURPLE = "#009E73", "#CC79A7"  # two more of Okabe and Ito's
+GREEN, PURPLE = "#009E73", "#CC79A7"  # These are two more colours of Okabe and Ito.
 
 
 @one_figure
 def flat_curve(weights, gammas, horizon: int):
-    """Left, the heads' weighted discounts, w_i gamma_i^t; right, their sum, far beyond the horizon too."""
+    """Draws the weighted discounts of the heads, w_i gamma_i^t, and their sum.
+
+    Both panels show three times the horizon.
+    """
     steps = 3 * horizon
     figure, (parts, whole) = subplots(1, 2, figsize=(12, 4.6))
     for weight, gamma, style in zip(weights, gammas, ("-", "--", ":", "-.", "-"), strict=False):
@@ -34,10 +39,10 @@ def flat_curve(weights, gammas, horizon: int):
 
 @one_figure
 def model_sizes(table, trained: dict):
-    """Error against the size of the model, a panel per test noise, a line per training noise.
+    """Draws the error over the model size, with one panel per test noise and one line per training noise.
 
-    `table` is the study's (`reconstruction_study`); `trained` maps words for a training noise to its (noise,
-    noise_rate). Dots are random sequences; the linear model stands at the left.
+    `table` is the table of `reconstruction_study`. `trained` maps the name of a training noise to its (noise,
+    noise_rate). Each dot is the error on random sequences. The linear model is at the left.
     """
     tests = {"clean inputs": (0.0, 0.0), "noise 0.1": (0.1, 0.0), "0.01 cost per step": (0.0, 0.01)}
     figure, axes = subplots(1, len(tests), figsize=(12, 4.8))
@@ -63,9 +68,9 @@ def model_sizes(table, trained: dict):
 
 @one_figure
 def time_limits(ratios):
-    """Reconstructed cost in units of the true cost of an episode, a group of bars per task.
+    """Draws the reconstructed cost divided by the true cost of an episode, with a group of bars per task.
 
-    `ratios` maps a task to {treatment: ratio}; every task has the same treatments.
+    `ratios` maps a task to {treatment: ratio}. Every task has the same treatments.
     """
     words = list(next(iter(ratios.values())))
     colours = dict(zip(words, (LIMIT, COST, REWARD, "#56B4E9"), strict=False))
@@ -84,7 +89,10 @@ def time_limits(ratios):
 
 @one_figure
 def settling(updates, curves, truth: float):
-    """Reconstructed cost while the critics still learn, a line per model; dashed: the truth."""
+    """Draws the reconstructed cost over the updates of the critics, with one line per model.
+
+    The dashed line is the true cost.
+    """
     figure, ax = subplots(figsize=(11, 4.6))
     styles = zip(("-", "--", ":", "-."), (REWARD, COST, GREEN, PURPLE), strict=True)
     for (name, values), (style, colour) in zip(curves.items(), styles, strict=False):
@@ -98,10 +106,12 @@ def settling(updates, curves, truth: float):
 
 @one_figure
 def head_error(models, task: Task, head: int, error: float, cost: float = 60):
-    """A steady cost whose head number `head` (from 1) is off by `error`: what models make of it.
+    """Draws the costs that models reconstruct from the heads of a steady cost when one head has an error.
 
-    Left, the three heads; right, each model's answer for every error. The band holds the errors with which
-    some cost sequence could have these heads; the bar, where there is one, the costs that it could have.
+    `head` counts from 1, and `error` is added to that head. The left panel shows the heads. The right panel
+    shows the answer of each model for every error. The grey band contains the errors for which some cost
+    sequence has these heads. If some sequence has the heads with `error`, a bar shows the range of its
+    possible costs.
     """
     heads = steady_heads(task, cost)
     off = error * (np.arange(len(heads)) == head - 1)

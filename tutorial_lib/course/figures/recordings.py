@@ -1,4 +1,4 @@
-"""Notebook 02: recordings before anything is learned from them."""
+"""The figures of notebook 02: the recordings, before any training."""
 
 import numpy as np
 from matplotlib.colors import LogNorm
@@ -22,10 +22,11 @@ DOTS = {"marker": "o", "linestyle": "none", "markersize": 3, "alpha": 0.4, "mark
 
 @one_figure
 def planes(datasets: dict, frontier: bool = False):
-    """Every episode of every dataset {task name: Dataset} by cost and return, thresholds dashed.
+    """Draws every episode by its cost and its return, with one panel per dataset.
 
-    `frontier` adds the best return left under each limit, the best mixture of episodes, and DSRL's frontier
-    where it was read.
+    `datasets` is {task name: Dataset}. Dashed lines are the thresholds. `frontier` adds the best return left
+    under each limit and the best mixture of episodes. It also adds DSRL's frontier for the tasks where it was
+    read off the plots.
     """
     figure, axes = task_panels(datasets, 3.6)
     for ax, (name, data) in zip(axes.flat, datasets.items(), strict=False):
@@ -50,7 +51,11 @@ def planes(datasets: dict, frontier: bool = False):
 
 @one_figure
 def filtered(dataset, task: Task, limit: float):
-    """BC-Safe's filter at one limit: which episodes pass; and, over all limits, how many and how good."""
+    """Draws BC-Safe's filter at one limit, and its effect over all limits.
+
+    The left panel shows the episodes that pass. The right panel shows the share of episodes that pass and
+    their best return.
+    """
     passes = dataset.episode_costs <= limit
     costs, returns = dataset.episode_costs, dataset.episode_returns
     figure, (plane, over) = subplots(1, 2, figsize=(12, 4.8))
@@ -78,7 +83,10 @@ def filtered(dataset, task: Task, limit: float):
 
 @one_figure
 def visited(datasets: dict):
-    """Where the robot was after each recorded step, as steps per bin; lines mark the cost zones."""
+    """Draws the number of recorded steps in each bin of the robot's position after the step.
+
+    Lines mark the cost zones.
+    """
     figure, axes = task_panels(datasets, 3.5)
     for ax, (name, data) in zip(axes.flat, datasets.items(), strict=False):
         scene = scene_of(get_task(name))
@@ -96,7 +104,10 @@ def visited(datasets: dict):
 
 @one_figure
 def examples_left(datasets: dict, share: float = 0.9):
-    """Episodes that pass each threshold's filter, and those of them that earn nearly the best return left."""
+    """Draws the number of episodes that pass the filter at each threshold.
+
+    A second bar counts those that earn at least `share` of the best return left.
+    """
     figure, axes = task_panels(datasets, 3.4)
     for ax, (name, data) in zip(axes.flat, datasets.items(), strict=False):
         thresholds = get_task(name).thresholds
@@ -116,7 +127,10 @@ def examples_left(datasets: dict, share: float = 0.9):
 
 @one_figure
 def at_the_wall(push, crossed, bins: int = 8):
-    """Recorded pushes towards the wall (n,) in [-1, 1], and the share of each bin that soon crosses it."""
+    """Draws a histogram of pushes towards the wall (n,), and the share in each bin that soon crosses it.
+
+    A push lies in [-1, 1].
+    """
     edges = np.linspace(-1, 1, bins + 1)
     place = np.clip(np.digitize(push, edges) - 1, 0, bins - 1)
     counts = np.bincount(place, minlength=bins)
@@ -134,7 +148,11 @@ def at_the_wall(push, crossed, bins: int = 8):
 
 @one_figure
 def to_go(steps, masked, continued, level: float):
-    """Mean discounted return-to-go over the step: the recording's end as the end, and as a cut."""
+    """Draws the mean discounted return-to-go at each step, for two treatments of the end of a recording.
+
+    The first treatment takes it as the end of the episode. The second takes it as a cut, after which the
+    robot continues at its rate.
+    """
     figure, ax = subplots(figsize=(11, 4.4))
     ax.plot(steps, continued, color=REWARD, label="a cut: the robot goes on at its rate")
     ax.plot(steps, masked, color=COST, label="the end: nothing follows")

@@ -1,4 +1,4 @@
-"""Training, results and data: learning curves, scores, predicted against paid cost, the cost-return plane."""
+"""The figures of training and evaluation: learning curves, scores, and predicted against paid cost."""
 
 import csv
 from pathlib import Path
@@ -29,9 +29,10 @@ SQUARED_ERRORS = {
 
 @one_figure
 def learning_curves(log, names=tuple(CURVES)):
-    """Scalars of a training run over its updates, one panel each, one line per seed.
+    """Draws scalars of a run over its updates, with one panel per scalar and one line per seed.
 
-    Squared errors have a logarithmic scale. `log` is what `training.train` returns, or a metrics.csv.
+    Squared errors have a logarithmic scale. `log` is the value that `training.train` returns, or the path of
+    a metrics.csv.
     """
     rows = _read_log(log)
     columns = min(3, len(names))
@@ -63,7 +64,7 @@ def _read_log(log) -> list[dict[str, float]]:
 
 @one_figure
 def scores(results):
-    """Return and cost per threshold: every episode a dot, the mean with its 95% bootstrap interval."""
+    """Draws return and cost per threshold: a dot per episode and the 95% bootstrap interval of the mean."""
     table = summarise(results)
     place = {threshold: x for x, threshold in enumerate(sorted(table["threshold"]))}
     episodes = with_scores(results)
@@ -89,7 +90,10 @@ def scores(results):
 
 @one_figure
 def predicted_against_paid(results):
-    """The cost that the critics expected at an episode's first step, and what it paid: a panel per limit."""
+    """Draws the cost that the critics predict at the first step and the paid cost, a panel per limit.
+
+    Each dot is an episode.
+    """
     limits = sorted(results["threshold"].unique())
     figure, axes = subplots(
         1, len(limits), figsize=(4 * len(limits), 4.3), sharex=True, sharey=True, squeeze=False
