@@ -152,7 +152,7 @@ def noise_levels(results, limit: float = 50):
 @one_figure
 @or_not_run
 def against_paper(results, algorithm: str = "C2IQL"):
-    """Draws every task's return and cost beside the paper's: seeds as dots, their mean with a 95% interval."""
+    """Draws every task's return and cost beside the paper's: seeds, and their mean with its 95% interval."""
     part = seed_means(results[results["algorithm"] == algorithm], ("task",))
     tasks = list(part["task"].unique())
     figure, axes = subplots(1, 2, figsize=(12, 4.6))
