@@ -100,5 +100,5 @@ lock:
 		--no-annotate --custom-compile-command "make lock"
 
 clean:
-	rm -rf build $(VENV) *.egg-info .pytest_cache .ruff_cache
+	rm -rf build $(VENV) *.egg-info .pytest_cache .ruff_cache .mypy_cache
 	find . -name __pycache__ -prune -exec rm -rf {} +
