@@ -215,7 +215,7 @@ def random_transitions(task: Task, count: int, device: Device = "cpu") -> Batch:
     generator = torch.Generator().manual_seed(0)
     shapes = [(count, task.obs_dim), (count, task.act_dim), (count,), (count,), (count, task.obs_dim)]
     data = [torch.rand(shape, generator=generator).to(device) for shape in shapes]
-    return Batch(*data, *torch.zeros(2, count, device=device))
+    return Batch(*data, *torch.zeros(5, count, device=device))
 
 
 def _wait_for(device: Device) -> None:

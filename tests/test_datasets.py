@@ -67,13 +67,24 @@ def test_a_dataset_ends_with_an_episode(arrays):
 def test_tensors_hold_the_arrays_and_are_a_copy(dataset, arrays):
     before = {key: values.copy() for key, values in arrays.items()}
     batch = dataset.tensors()
-    assert set(batch._fields) == set(arrays)
+    assert set(batch._fields) == {*arrays, "timesteps", "returns_to_go", "costs_to_go"}
     for key in arrays:
         tensor = getattr(batch, key)
         assert tensor.dtype == torch.float32 and tensor.shape == arrays[key].shape
         np.testing.assert_array_equal(tensor.numpy(), arrays[key].astype(np.float32))
         tensor.fill_(-9)
     assert_same(dataset, before)
+
+
+def test_tensors_say_where_in_its_episode_a_transition_stands(dataset):
+    batch, row = dataset.tensors(), 0
+    for start, end in zip(dataset.starts, dataset.ends, strict=True):
+        for t in range(end - start):
+            assert batch.timesteps[row] == t
+            assert batch.costs_to_go[row] == sum(dataset.costs[row:end].tolist())
+            assert batch.returns_to_go[row] == pytest.approx(sum(dataset.rewards[row:end].tolist()), rel=1e-6)
+            row += 1
+    assert row == len(dataset)
 
 
 def test_sampled_rows_belong_together_and_are_uniform(dataset):

@@ -32,7 +32,7 @@ class Batch(NamedTuple):
     """B transitions as float32 tensors.
 
     observations and next_observations are (B, obs), actions (B, act), all others (B,). The flags terminals
-    and timeouts are 0 or 1.
+    and timeouts are 0 or 1. The last three describe a transition's place in its episode.
     """
 
     observations: torch.Tensor
@@ -42,6 +42,12 @@ class Batch(NamedTuple):
     next_observations: torch.Tensor
     terminals: torch.Tensor
     timeouts: torch.Tensor
+    timesteps: torch.Tensor
+    """The number of steps that the episode has before the transition."""
+    returns_to_go: torch.Tensor
+    """The undiscounted sum of the rewards from the transition to the end of the episode."""
+    costs_to_go: torch.Tensor
+    """The undiscounted sum of the costs from the transition to the end of the episode."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,6 +110,25 @@ class Dataset:
         """(N,): the number of each row's episode, counted from 0."""
         return np.repeat(np.arange(self.num_episodes), self.episode_lengths)
 
+    @property
+    def timesteps(self) -> np.ndarray:
+        """(N,): the number of steps that each row's episode has before it."""
+        return np.arange(len(self)) - self.starts[self.episode_index]
+
+    @property
+    def returns_to_go(self) -> np.ndarray:
+        """(N,) float64: the undiscounted sum of the rewards from each row to the end of its episode."""
+        return self._to_go(self.rewards)
+
+    @property
+    def costs_to_go(self) -> np.ndarray:
+        """(N,) float64: the undiscounted sum of the costs from each row to the end of its episode."""
+        return self._to_go(self.costs)
+
+    def _to_go(self, values: np.ndarray) -> np.ndarray:
+        sums = np.concatenate(([0.0], np.cumsum(values, dtype=np.float64)))
+        return sums[self.ends][self.episode_index] - sums[:-1]
+
     @cached_property
     def checksum(self) -> str:
         """The SHA-256 of all values, in hexadecimal.
@@ -132,7 +157,7 @@ class Dataset:
     def tensors(self, device: torch.device | str = "cpu") -> Batch:
         """A copy of all N transitions as one Batch on `device`. Training draws its batches from it."""
         options: dict[str, Any] = {"dtype": torch.float32, "device": device}
-        return Batch(**{key: torch.tensor(getattr(self, key), **options) for key in KEYS})
+        return Batch(**{key: torch.tensor(getattr(self, key), **options) for key in Batch._fields})
 
 
 def sample_batch(data: Batch, batch_size: int, generator: torch.Generator) -> Batch:
