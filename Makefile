@@ -7,6 +7,8 @@
 #   make lab         JupyterLab on the notebooks
 #   make notebooks   execute the notebooks and store their outputs in them
 #   make lock        resolve environment.lock anew from pyproject.toml
+#   make resolve     ask for ready-made packages for Linux, macOS and Windows; nothing is installed
+#   make release     wheel, source archive, and an archive of data/ for those who install the wheel
 #   make clean       remove all that make has made, .venv too
 #
 # Another Python than python3: make PYTHON=python3.11 test
@@ -15,7 +17,9 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin/python
 READY := $(VENV)/ready
-PIP := $(BIN) -m pip install --quiet
+# Twice quiet: errors are shown, warnings are not.
+PIP := $(BIN) -m pip install --quiet --quiet
+UV := build/uv/bin/uv
 
 NOTEBOOKS := $(sort $(wildcard notebooks/[0-9]*.ipynb))
 EXECUTED := $(NOTEBOOKS:%=build/pages/%)
@@ -30,7 +34,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 export PYTHONUTF8 := 1
 export IPYTHONDIR := $(CURDIR)/build/ipython
 
-.PHONY: course slides student test lab notebooks lock clean
+.PHONY: course slides student test lab notebooks lock resolve release clean
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
 
@@ -56,16 +60,16 @@ student: $(READY)
 	@echo "The notebooks without solutions lie in $(CURDIR)/build/student."
 
 test: $(READY)
-	$(BIN) -m pytest --durations=10 tests
-	$(if $(NOTEBOOKS),$(BIN) -m pytest --durations=10 --nbval-lax --nbval-current-env --nbval-cell-timeout 600 \
+	@$(BIN) -m pytest --durations=10 tests
+	@$(if $(NOTEBOOKS),$(BIN) -m pytest --durations=10 --nbval-lax --nbval-current-env --nbval-cell-timeout 600 \
 		--nbval-sanitize-with tests/sanitize.cfg $(NOTEBOOKS))
 
 lab: $(READY)
-	$(BIN) -m jupyterlab --ip=127.0.0.1 --LabApp.default_url=/lab/tree/notebooks \
+	@$(BIN) -m jupyterlab --ip=127.0.0.1 --LabApp.default_url=/lab/tree/notebooks \
 		$(if $(filter 0,$(shell id -u)),--allow-root)
 
 notebooks: $(EXECUTED)
-	cp -p $(EXECUTED) notebooks
+	@cp -p $(EXECUTED) notebooks
 
 # The kernel warns at every start that it talks in plain text, unless it need not.
 QUIETLY := --log-level=ERROR --KernelManager.transport_encryption=auto
@@ -85,20 +89,46 @@ $(READY): environment.lock pyproject.toml
 	@$(PYTHON) -c 'import sys; v = sys.version_info; v >= (3, 11) or sys.exit("The course needs Python 3.11 or \
 	newer, and $(PYTHON) is %d.%d. Try: make PYTHON=python3.11 $(MAKECMDGOALS)" % v[:2])'
 	@echo "Setting up $(VENV): some minutes, 2 GB (more where PyTorch brings CUDA)."
-	$(PYTHON) -m venv $(VENV)
-	$(PIP) --constraint environment.lock torch
-	$(PIP) --no-deps --requirement environment.lock
-	$(PIP) --no-deps --no-build-isolation --editable .
+	@$(PYTHON) -m venv $(VENV)
+	@echo "1 of 3: PyTorch"
+	@$(PIP) --constraint environment.lock torch
+	@echo "2 of 3: all other packages. Where pip compiles the simulator, this takes some ten minutes."
+	@$(PIP) --no-deps --requirement environment.lock
+	@echo "3 of 3: the course's own library"
+	@$(PIP) --no-deps --no-build-isolation --editable .
 	@touch $@
+
+$(UV):
+	@$(PYTHON) -m venv build/uv
+	@build/uv/bin/python -m pip install --quiet --quiet uv
 
 # Keeps the releases that are in the lock where they still fit; remove the file first to take the newest of all.
 # The overrides, and why bullet-safety-gym needs one, are in pyproject.toml.
-lock:
-	$(PYTHON) -m venv build/uv
-	build/uv/bin/python -m pip install --quiet uv
-	build/uv/bin/uv pip compile pyproject.toml --output-file environment.lock --quiet \
+lock: $(UV)
+	@$(UV) pip compile pyproject.toml --output-file environment.lock --quiet \
 		--no-annotate --custom-compile-command "make lock"
 
+# Fails where a package of the lock has no ready-made wheel for a system that README.md calls resolved. PyTorch's
+# wheels need macOS 14. uv reads nothing in pyproject.toml here, and downloads no Python.
+resolve: $(UV)
+	@for system in x86_64-unknown-linux-gnu aarch64-apple-darwin x86_64-pc-windows-msvc; do \
+		for python in 3.11 3.12 3.13; do \
+			echo "$$system, Python $$python"; \
+			MACOSX_DEPLOYMENT_TARGET=14.0 UV_PYTHON_DOWNLOADS=never $(UV) pip compile environment.lock --no-config \
+				--quiet --no-deps --only-binary :all: --python-platform $$system --python-version $$python \
+				>/dev/null || exit 1; \
+		done; \
+	done
+
+# Built from a copy, so that setuptools leaves nothing in the project's folder.
+release: $(READY)
+	@rm -rf build/release && mkdir -p build/release/source
+	@cp -r tutorial_lib pyproject.toml MANIFEST.in README.md LICENSE build/release/source
+	@cd build/release/source && $(CURDIR)/$(BIN) -c \
+		'from setuptools.build_meta import *; build_wheel(".."), build_sdist("..")' >../log 2>&1 || { cat ../log; exit 1; }
+	@rm -r build/release/source build/release/log
+	@$(BIN) -c 'from tutorial_lib.data.release import write_archive; write_archive("data", "build/release")'
+
 clean:
-	rm -rf build $(VENV) *.egg-info .pytest_cache .ruff_cache .mypy_cache
-	find . -name __pycache__ -prune -exec rm -rf {} +
+	@rm -rf build $(VENV) *.egg-info .pytest_cache .ruff_cache .mypy_cache
+	@find . -name __pycache__ -prune -exec rm -rf {} +
