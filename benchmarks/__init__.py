@@ -28,6 +28,7 @@ from tutorial_lib.config import PROFILES
 from tutorial_lib.files import written_whole
 from tutorial_lib.matmul import bfloat16_time
 from tutorial_lib.tasks import Task, get_task
+from tutorial_lib.tasks.bullet import pybullet_package
 
 __all__ = ["PARTS", "bench", "full", "install", "machine", "training"]
 BUSY = 10
@@ -131,6 +132,6 @@ def machine(device: Device, busy: float) -> pd.DataFrame:
         "busy before the start": f"{busy:.0f}%",
         "system": platform.system(),
         "Python": platform.python_version(),
-        **{name: version(name) for name in ("torch", "numpy", "pybullet")},
+        **{name: version(name) for name in ("torch", "numpy", pybullet_package())},
     }
     return pd.DataFrame({"what": facts.keys(), "value": facts.values()})

@@ -8,11 +8,24 @@ both, so that a seed repeats an episode whatever ran before it.
 import contextlib
 import sys
 import warnings
+from importlib.metadata import PackageNotFoundError, version
 
 import gymnasium
 import numpy as np
 
 from tutorial_lib.tasks.record import Task
+
+
+def pybullet_package() -> str:
+    """The installed package that brings the module `pybullet`.
+
+    It is pybullet-arm64 where pybullet has no ready-made files, for example on macOS on Arm.
+    """
+    try:
+        version("pybullet-arm64")
+    except PackageNotFoundError:
+        return "pybullet"
+    return "pybullet-arm64"
 
 
 class BulletTask(gymnasium.Env):

@@ -11,8 +11,11 @@ import numpy as np
 from tutorial_lib.course.checks.checker import check_that, try_answer
 from tutorial_lib.scores import normalised_return
 from tutorial_lib.tasks import get_task
+from tutorial_lib.tasks.bullet import pybullet_package
 
-PACKAGES = ("torch", "numpy", "gymnasium", "pybullet", "bullet-safety-gym", "matplotlib", "ipywidgets")
+PACKAGES = (
+    "torch", "numpy", "gymnasium", pybullet_package(), "bullet-safety-gym", "matplotlib", "ipywidgets",
+)  # fmt: skip
 
 
 def check_setup() -> None:
