@@ -24,7 +24,7 @@ from safetensors.numpy import load_file, save_file
 from tutorial_lib.data import collect as collecting
 from tutorial_lib.data import ppo
 from tutorial_lib.data.behaviour import KINDS, LagrangianCost, PricedCost, RecordedTask, along_own_axes
-from tutorial_lib.data.collect import SOURCES, read_source, thin
+from tutorial_lib.data.collect import SOURCES, read_source
 from tutorial_lib.data.dataset import KEYS
 from tutorial_lib.data.hdf5 import read_dataset
 from tutorial_lib.data.ppo import load_ppo, make_ppo, run_ppo, save_ppo
@@ -35,7 +35,7 @@ from tutorial_lib.tasks.recipes import RECIPES, Recipe
 # PPO says so because 1616 is no multiple of 512.
 pytestmark = pytest.mark.filterwarnings("ignore:You have specified a mini-batch size")
 ROOT = Path(__file__).parents[1]
-BALL = TASKS["BallRun"]  # T = 100, cost range 80
+BALL, ANT = TASKS["BallRun"], TASKS["AntRun"]  # T = 100, cost range 80
 BATCH = 1616  # an episode of 100 steps in each of the 16 environments, and one step of the next
 SLICE = 2 * BATCH  # the multiplier looks at the episodes of the first batch
 RECIPE = Recipe(
@@ -46,99 +46,6 @@ RECIPE = Recipe(
     learning_rate=(1e-3, 2e-4),
     limit_falls=(0.0, 0.01),
 )
-
-
-# --- Thinning ---
-
-
-def plane(seed, count=3_000):
-    """Episodes crowded at low cost, as training leaves them, some of them out of bounds."""
-    rng = np.random.default_rng(seed)
-    costs = np.minimum(rng.exponential(25, count), 100).round()
-    return costs, rng.normal(500, 250, count) + 4 * costs
-
-
-def count_bins(costs, returns, kept, max_cost, low, high):
-    """How many of some episodes lie in each (column, row) of the grid, counted one by one."""
-    counts = Counter()
-    for i in kept:
-        column = min(int(costs[i] / max_cost * 20), 19)
-        row = min(int((returns[i] - low) / (high - low) * 20), 19)
-        counts[column, row] += 1
-    return counts
-
-
-@pytest.mark.parametrize("n", [1, 50, 500, 1_000, 100_000])
-@pytest.mark.parametrize("seed", range(3))
-def test_thinning_is_even_over_cost_and_within_a_cost_over_return(seed, n):
-    costs, returns = plane(seed)
-    kept = thin(costs, returns, n, max_cost=80, max_return=1_000)
-    assert len(set(kept)) == len(kept) and list(kept) == sorted(kept)
-    allowed = [i for i in range(len(costs)) if costs[i] <= 80 and returns[i] <= 1_000]
-    assert set(kept) <= set(allowed) and len(allowed) < len(costs)
-
-    low, high = min(returns[allowed]), max(returns[allowed])
-    there = count_bins(costs, returns, allowed, 80, low, high)
-    taken = count_bins(costs, returns, kept, 80, low, high)
-    columns = Counter()
-    for (column, _), count in there.items():
-        columns[column] += count
-    for k in range(1, len(costs)):  # the smallest number per column that gives n in all
-        if sum(min(k, count) for count in columns.values()) >= min(n, len(allowed)):
-            break
-    for column, count in columns.items():
-        rows = [row for c, row in there if c == column]
-        assert sum(taken[column, row] for row in rows) == min(k, count)
-        most = max(taken[column, row] for row in rows)
-        for row in rows:  # a bin gives fewer than another only where it has no more, or at the last turn
-            assert taken[column, row] in (there[column, row], most, most - 1)
-    assert min(n, len(allowed)) <= len(kept) < min(n, len(allowed)) + len(columns)
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_thinning_keeps_the_cheapest_episode_of_the_frontier_in_every_bin_it_takes_from(seed):
-    rng = np.random.default_rng(seed)
-    costs = rng.integers(0, 81, 600)
-    returns = 5 * costs + rng.uniform(0, 100, 600)  # costs earn, so nearly every cost has a frontier episode
-    kept = set(thin(costs, returns, 200, max_cost=80, max_return=1_000).tolist())
-    everyone, low, high = range(600), returns.min(), returns.max()
-    frontier = [
-        i for i in everyone if not any(costs[j] <= costs[i] and returns[j] > returns[i] for j in everyone)
-    ]
-
-    def bin_of(i):
-        return min(int(costs[i] / 4), 19), min(int((returns[i] - low) / (high - low) * 20), 19)
-
-    first = {}
-    for i in sorted(frontier, key=lambda i: costs[i]):
-        first.setdefault(bin_of(i), i)
-    taken = {bin_of(i) for i in kept}
-    assert sum(place in taken for place in first) > 20
-    assert all(i in kept for place, i in first.items() if place in taken)
-
-
-def test_thinning_draws_at_random_within_a_bin_and_the_same_every_time():
-    costs, returns = np.zeros(1_000), np.full(1_000, 7.0)  # all in one bin
-    kept = thin(costs, returns, 100, 80, 1_000, seed=1)
-    assert len(kept) == 100 and 300 < kept.mean() < 700
-    assert kept.tolist() == thin(costs, returns, 100, 80, 1_000, seed=1).tolist()
-    assert kept.tolist() != thin(costs, returns, 100, 80, 1_000, seed=2).tolist()
-
-
-def test_to_keep_no_episode_is_refused():
-    with pytest.raises(ValueError, match="at least one episode, not 0"):
-        thin(np.zeros(5), np.zeros(5), 0, 10, 10)
-
-
-def test_that_no_episode_is_left_is_refused_in_one_line():
-    with pytest.raises(
-        ValueError, match="^none of 2 episodes has a cost of at most 10 and .* 7: collect more$"
-    ):
-        thin(np.array([11.0, 5.0]), np.array([0.0, 8.0]), 1, 10, 7)
-
-
-def test_the_highest_cost_and_return_themselves_are_kept():
-    assert thin(np.array([80.0, 80.5, 10.0]), np.array([5.0, 5.0, 1_000.0]), 9, 80, 1_000).tolist() == [0, 2]
 
 
 # --- What agents are charged, and what they observe ---
@@ -514,13 +421,12 @@ def test_collected_episodes_become_a_dataset(uninterrupted, tmp_path, monkeypatc
     attributes = data.attributes
     assert attributes["task"] == "BallRun" and attributes["made_by"] == "c2iql collect BallRun"
     assert attributes["collected_episodes"] == 128 and attributes["recipe"] == str(asdict(RECIPE))
-    states = [load_file(folder / "BallRun" / s / "state-002.safetensors") for s in SOURCES]
-    assert attributes["wall_seconds"] == round(sum(float(state["seconds"]) for state in states)) > 0
+    assert attributes["collected_steps"] == 2 * RECIPE.steps
     assert "CC BY" in attributes["licence"] and "seeds" not in attributes
     for package in ("stable-baselines3", "pybullet", "bullet-safety-gym", "torch"):
-        assert f"{package} " in attributes["versions"]
+        assert package in attributes["versions"]
 
-    assert 20 <= data.num_episodes <= 40
+    assert data.num_episodes == 20
     assert (data.episode_lengths == 100).all() and data.timeouts.sum() == data.num_episodes
     assert np.isin(data.costs, (0, 1)).all() and np.abs(data.actions).max() <= 1
     follows = np.flatnonzero(~data.timeouts)
@@ -533,10 +439,10 @@ def test_collected_episodes_become_a_dataset(uninterrupted, tmp_path, monkeypatc
         for source, run in ((source, folder / "BallRun" / source) for source in SOURCES)
     }
     found = [
-        (source, int(np.flatnonzero((starts == row).all(axis=1))[0]))
+        (source, int(np.flatnonzero(np.isclose(starts, row, rtol=3.1e-5, atol=0).all(axis=1))[0]))
         for row in data.observations[data.starts]
         for source, starts in starts_of.items()
-        if (starts == row).all(axis=1).any()
+        if np.isclose(starts, row, rtol=3.1e-5, atol=0).all(axis=1).any()
     ]
     assert len(found) == data.num_episodes
     assert found == sorted(found, key=lambda f: (SOURCES.index(f[0]), f[1]))
@@ -550,7 +456,7 @@ def test_collected_episodes_become_a_dataset(uninterrupted, tmp_path, monkeypatc
         with pytest.raises(ValueError, match=f"^{run}: was begun with another recipe"):
             collecting.collect(BALL, SOURCES, replace(RECIPE, **change), folder, out, workers=1)
     fewer = replace(RECIPE, episodes=5, return_bins=1)  # only thinned in another way
-    assert collecting.collect(BALL, SOURCES, fewer, folder, out, workers=1).num_episodes < 20
+    assert collecting.collect(BALL, SOURCES, fewer, folder, out, workers=1).num_episodes == 5
 
 
 def write_run(folder, slices, first_tag):
@@ -560,15 +466,17 @@ def write_run(folder, slices, first_tag):
     for index, episodes in enumerate(slices):
         rows = {key: [] for key in KEYS}
         for cost, terminal in episodes:
-            steps = max(3, cost)
+            steps = max(3, cost) if terminal else ANT.horizon
             for step in range(steps):
                 last = step == steps - 1
-                rows["observations"].append([tag] * 7), rows["next_observations"].append([tag + 0.5] * 7)
-                rows["actions"].append([0.1, -0.1]), rows["rewards"].append(tag / 10)
+                rows["observations"].append([tag + step / 1000] * 33)
+                rows["next_observations"].append([tag + (step + 1) / 1000] * 33)
+                rows["actions"].append([0.1, -0.1] * 4), rows["rewards"].append(tag / 1000)
                 rows["costs"].append(float(step < cost))
                 rows["terminals"].append(last and terminal), rows["timeouts"].append(last and not terminal)
             tag, total = tag + 1, total + 1
         arrays = {key: np.array(values) for key, values in rows.items()}
+        arrays = {key: v.astype(np.float32) if v.dtype == float else v for key, v in arrays.items()}
         save_file(arrays, folder / f"episodes-{index:03d}.safetensors")
     save_file({"seconds": np.array(10.0)}, folder / f"state-{len(slices):03d}.safetensors")
 
@@ -578,22 +486,23 @@ def write_run(folder, slices, first_tag):
 )
 def test_the_episodes_of_a_source_stand_together_in_the_order_of_sources(sources, tmp_path, monkeypatch):
     """Every episode carries a tag: hundreds for the source, and its place in the run."""
-    runs = tmp_path / "BallRun"
+    runs = tmp_path / "AntRun"
     write_run(
-        runs / "priced-0", [[(0, True), (5, False), (90, False)], [(7, False), (81, True), (3, True)]], 100
+        runs / "priced-0", [[(0, True), (5, False), (190, False)], [(7, False), (181, True), (3, True)]], 100
     )
-    write_run(runs / "lagrangian-7", [[(85, False), (99, False)]], 200)  # all cost more than 80
-    write_run(runs / "priced-2", [[(2, False)], [(90, True)], [(1, True), (4, False)]], 300)
+    write_run(runs / "lagrangian-7", [[(185, False), (199, False)]], 200)  # all cost more than 150
+    write_run(runs / "priced-2", [[(2, False)], [(190, True)], [(1, True), (4, False)]], 300)
     asked = []
     monkeypatch.setattr(collecting, "run_ppo", lambda *arguments: asked.append(arguments))
-    made = collecting.collect(BALL, sources, RECIPE, tmp_path, tmp_path / "out.hdf5", workers=1)
+    made = collecting.collect(ANT, sources, RECIPE, tmp_path, tmp_path / "out.hdf5", workers=1)
 
     tags = {"priced-0": [100, 101, 103, 105], "lagrangian-7": [], "priced-2": [300, 302, 303]}
     assert made.observations[made.starts, 0].tolist() == [tag for source in sources for tag in tags[source]]
-    assert made.observations[made.ends - 1, 0].tolist() == made.observations[made.starts, 0].tolist()
+    last = made.observations[made.ends - 1, 0] - (made.episode_lengths - 1) / 1000
+    assert last == pytest.approx(made.observations[made.starts, 0], abs=0.02)  # rounded
     assert json.loads(made.attributes["episodes_by_source"]) == {s: len(tags[s]) for s in sources}
     assert list(json.loads(made.attributes["episodes_by_source"])) == list(sources)
-    assert (made.attributes["collected_episodes"], made.attributes["wall_seconds"]) == (12, 30)
+    assert made.attributes["collected_episodes"] == 12
     costs = {100: 0, 101: 5, 103: 7, 105: 3, 300: 2, 302: 1, 303: 4}
     assert made.episode_costs.tolist() == [costs[tag] for source in sources for tag in tags[source]]
     assert [(kind, seed, run) for _, _, kind, seed, run in asked] == [

@@ -5,7 +5,7 @@ import hashlib
 import numpy as np
 import pytest
 import torch
-from five_episodes import LENGTHS, assert_same, episodes_by_loop, h5_file, make_arrays
+from five_episodes import LENGTHS, SHORT_TASKS, assert_same, episodes_by_loop, h5_file, make_arrays
 
 from tutorial_lib.data.dataset import KEYS, Dataset, DatasetError, sample_batch
 from tutorial_lib.data.hdf5 import read_dataset, write_dataset
@@ -111,11 +111,12 @@ def test_a_checksum_is_of_the_values_and_not_of_the_file(arrays, tmp_path):
     digest = hashlib.sha256()
     for key in KEYS:
         digest.update(arrays[key].tobytes())
+    task = SHORT_TASKS["CarRun"]
     plain = h5_file(tmp_path / "plain.hdf5", arrays)
-    packed = write_dataset(tmp_path / "packed.hdf5", Dataset(**arrays), "CarRun", {"seed": 4})
+    packed = write_dataset(tmp_path / "packed.hdf5", Dataset(**arrays), task, {"seed": 4})
     assert plain.read_bytes() != packed.read_bytes()
-    assert read_dataset(plain, "CarRun").checksum == read_dataset(packed, "CarRun").checksum
-    assert read_dataset(plain, "CarRun").checksum == digest.hexdigest()
+    assert read_dataset(plain, task).checksum == read_dataset(packed, task).checksum
+    assert read_dataset(plain, task).checksum == digest.hexdigest()
     for key in KEYS:
         changed = arrays | {key: arrays[key].copy()}
         changed[key][0] = 1 - changed[key][0] if changed[key].dtype != bool else ~changed[key][0]

@@ -10,7 +10,14 @@ import torch
 
 from tutorial_lib.agents import get_algorithm
 from tutorial_lib.playing import EPISODES_TOGETHER, evaluate, rollout
-from tutorial_lib.scores import normalised_cost, normalised_return, save_results, summarise, with_scores
+from tutorial_lib.scores import (
+    certificate,
+    normalised_cost,
+    normalised_return,
+    save_results,
+    summarise,
+    with_scores,
+)
 from tutorial_lib.tasks import TASKS, make_env
 
 OPTIONS = {"profile": "test", "hidden_width": 16, "hidden_layers": 1}
@@ -234,6 +241,15 @@ def test_results_are_the_sums_of_the_rollouts():
             assert part["predicted_cost"].tolist() == played.predicted_costs.tolist()
 
 
+def test_held_out_episodes_start_elsewhere():
+    agent = make_agent(seeds=(0, 2), task="BallRun")
+    results = evaluate(agent, [30], episodes=2, held_out=True)
+    for run, seed in enumerate((0, 2)):
+        played = rollout(agent, 30, [10_000_000 + 1000 * (seed + 1) + episode for episode in range(2)], run)
+        assert results[results["seed"] == seed]["return"].tolist() == played.rewards.sum(0).tolist()
+    assert set(results["return"]).isdisjoint(evaluate(agent, [30], episodes=2)["return"])
+
+
 @pytest.mark.parametrize("bad", [-1, -0.001, math.nan])
 def test_a_limit_that_is_none_is_refused(bad):
     with pytest.raises(ValueError, match="limit on the cost must be zero or more"):
@@ -342,3 +358,43 @@ def test_a_write_that_breaks_off_leaves_the_old_results(tmp_path):
     with pytest.raises(OSError, match="space"):
         save_results(Broken(), path)
     assert path.read_text() == "old"
+
+
+# --- Certificates ---
+
+
+def test_a_certificate_by_hand():
+    costs = [10.0, 20.0, 30.0, 36.0]
+    parts = [
+        results_of([0.0] * 4, costs=costs, predicted_cost=[1.0, 2.0, 3.0, 6.0]),
+        results_of([0.0] * 3, costs=[5.0, 5.0, 5.0], predicted_cost=math.nan, seed=1, threshold=70.0),
+    ]
+    first, second = certificate(pd.concat(parts)).to_dict("records")
+    assert (first["task"], first["algorithm"], first["seed"], first["threshold"]) == ("BallRun", "A", 0, 30)
+    assert (first["episodes"], first["cost"], first["predicted"], first["exceeds"]) == (4, 24, 3, 0.25)
+    half = 3.18245 * math.sqrt((14**2 + 4**2 + 6**2 + 12**2) / 3 / 4)  # Student's t with 3 degrees of freedom
+    assert (first["cost_low"], first["cost_high"]) == pytest.approx((24 - half, 24 + half), rel=1e-5)
+    assert (second["cost_low"], second["cost"], second["cost_high"]) == (5, 5, 5)
+    assert math.isnan(second["predicted"]) and (second["exceeds"], second["exceeds_low"]) == (0, 0)
+    assert second["exceeds_high"] == pytest.approx(1 - 0.025 ** (1 / 3))  # three episodes may all keep it
+
+
+@pytest.mark.parametrize("over, count", [(1, 4), (7, 20), (19, 20), (20, 20)])
+def test_the_chance_to_exceed_has_the_interval_of_clopper_and_pearson(over, count):
+    """At its ends, what was seen or more extreme has a chance of 2.5%."""
+
+    def at_least(k, p):
+        return sum(math.comb(count, j) * p**j * (1 - p) ** (count - j) for j in range(k, count + 1))
+
+    costs = [31.0] * over + [30.0] * (count - over)  # a cost that equals the limit keeps it
+    row = certificate(results_of([0.0] * count, costs=costs, predicted_cost=0.0)).iloc[0]
+    assert at_least(over, row["exceeds_low"]) == pytest.approx(0.025)
+    if over < count:
+        assert 1 - at_least(over + 1, row["exceeds_high"]) == pytest.approx(0.025)
+    else:
+        assert row["exceeds_high"] == 1
+
+
+def test_one_episode_proves_no_mean():
+    row = certificate(results_of([0.0], costs=[5.0], predicted_cost=0.0)).iloc[0]
+    assert (row["cost_low"], row["cost"], row["cost_high"]) == (0, 5, math.inf)

@@ -10,7 +10,7 @@ import threading
 
 import pooch
 import pytest
-from five_episodes import make_arrays, refused
+from five_episodes import SHORT_TASKS, make_arrays, refused
 
 from tutorial_lib.data import sources
 from tutorial_lib.data.dataset import Dataset
@@ -18,6 +18,12 @@ from tutorial_lib.data.hdf5 import write_dataset
 from tutorial_lib.tasks import TASKS
 
 CAR_RUN = TASKS["CarRun"]
+
+
+@pytest.fixture(autouse=True)
+def short_tasks(monkeypatch):
+    for name, task in SHORT_TASKS.items():
+        monkeypatch.setitem(TASKS, name, task)
 
 
 @pytest.fixture
@@ -70,6 +76,60 @@ def test_dsrl_keeps_its_files_under_home_unless_told_otherwise(monkeypatch, tmp_
 
 def test_the_shipped_data_lie_beside_the_package():
     assert sources.SHIPPED_DATA.parent.joinpath("tutorial_lib", "config.py").is_file()
+
+
+@pytest.mark.parametrize("name", ["~nobody-of-this-name/x.hdf5", "a\0b.hdf5", "x" * 5000])
+def test_an_impossible_path_is_no_file(name):
+    with refused("no such file: check the path"):
+        sources.load_dataset("CarRun", name)
+
+
+# --- Checksums ---
+
+
+def test_the_checksums_are_those_of_the_shipped_files():
+    lines = (sources.SHIPPED_DATA / "checksums.txt").read_text().splitlines()
+    files = sorted(sources.SHIPPED_DATA.glob("*.hdf5"))
+    assert len(files) == 8
+    assert lines == [f"{hashlib.sha256(file.read_bytes()).hexdigest()}  {file.name}" for file in files]
+
+
+def test_a_flipped_bit_of_a_shipped_file_is_noticed_wherever_it_is(places, dataset):
+    shipped, _ = places
+    path = write_dataset(shipped / "CarRun.hdf5", dataset, "CarRun")
+    whole = path.read_bytes()
+    sources.write_checksums()
+    assert sources.load_dataset("CarRun").checksum == dataset.checksum
+    for place in range(0, len(whole), 97):
+        path.write_bytes(whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :])
+        with refused(f"^{path}: file: damaged: SHA-256 is .*: restore it from git"):
+            sources.load_dataset("CarRun")
+    path.write_bytes(whole)
+    assert sources.load_dataset("CarRun", path).checksum == dataset.checksum
+
+
+def test_a_replaced_file_needs_new_checksums(places, dataset):
+    shipped, _ = places
+    path = write_dataset(shipped / "CarRun.hdf5", dataset, "CarRun")
+    sources.write_checksums()
+    write_dataset(path, dataset.select([0]), "CarRun")
+    with refused(r"sources.write_checksums\(\)"):
+        sources.load_dataset("CarRun")
+    assert sources.write_checksums() == shipped / "checksums.txt"
+    assert sources.load_dataset("CarRun").num_episodes == 1
+
+
+def test_only_shipped_files_are_verified_and_only_once(places, dataset, monkeypatch, tmp_path):
+    shipped, dsrl = places
+    write_dataset(shipped / "CarRun.hdf5", dataset, "CarRun")
+    sources.write_checksums()
+    for path in (dsrl / CAR_RUN.dsrl_file, shipped / "BallRun.hdf5"):  # the last has no line
+        write_dataset(path, dataset, path.stem if path.stem in TASKS else "CarRun")
+    hashed, sha256 = [], sources._sha256
+    monkeypatch.setattr(sources, "_sha256", lambda file: hashed.append(file) or sha256(file))
+    for task, source in [("CarRun", "dsrl"), ("BallRun", "shipped"), *[("CarRun", "shipped")] * 2]:
+        sources.load_dataset(task, source)
+    assert hashed == [shipped / "CarRun.hdf5"]
 
 
 # --- Fetching ---

@@ -1,4 +1,4 @@
-"""This module is the command line: `c2iql tasks | collect | fetch | train | evaluate | study | report`.
+"""The command line: `c2iql tasks | collect | fetch | data | train | evaluate | study | report`.
 
 tyro makes commands with types and help from functions and dataclasses, so each option is written only once.
 The commands import the other modules when they run, so that `c2iql --help` is fast.
@@ -77,6 +77,13 @@ def collect(
     out = out or runs / f"{get_task(task).name}.hdf5"
     dataset = collecting.collect(get_task(task), sources, recipe, runs, out, workers)
     print(f"{out}: {dataset.num_episodes} episodes, {len(dataset)} transitions")
+
+
+def data(words: tuple[str, ...] = ()) -> None:
+    """Check, convert and export files of datasets: `c2iql data check FILE --task TASK`."""
+    from tutorial_lib.data.commands import main
+
+    main(words)
 
 
 def train(words: tuple[str, ...] = ()) -> None:
@@ -273,10 +280,11 @@ def main() -> None:
     if words == ["--version"]:
         print(f"c2iql {version('c2iql-tutorial')}")
         return
-    commands = {f.__name__: f for f in (tasks, collect, fetch, train, evaluate, study, report)}
+    commands = {f.__name__: f for f in (tasks, collect, fetch, data, train, evaluate, study, report)}
     try:
-        if words[:1] == ["train"]:  # the options of `train` depend on its first arguments
-            train(tuple(words[1:]))
+        parsers = {"train": train, "data": data}  # their options depend on their first arguments
+        if words and words[0] in parsers:
+            parsers[words[0]](tuple(words[1:]))
         else:
             tyro.extras.subcommand_cli_from_dict(
                 commands, prog="c2iql", description="Safe offline reinforcement learning with C2IQL."

@@ -16,6 +16,8 @@ from tutorial_lib.tasks import make_env
 EPISODES_TOGETHER = 10
 """The number of episodes that share one process and one call of the policy. It is fixed, so that results do
 not depend on the number of workers: a matrix product can round differently in a batch of another size."""
+HELD_OUT_STARTS = 10_000_000
+"""What is added to the seeds of the episodes whose first states nothing was chosen on."""
 
 
 class Rollout(NamedTuple):
@@ -73,16 +75,17 @@ def evaluate(
     episodes: int = 10,
     workers: int = 1,
     seeds: Sequence[int] | None = None,
+    held_out: bool = False,
 ) -> pd.DataFrame:
     """Returns the raw results: one row per run, limit and episode.
 
     The default limits are those that a run was trained for, or else the task's own. The episodes of a run
-    start in the same states under every limit. The rows do not depend on the number of workers. With `seeds`,
-    only the runs with these seeds play. Raises ValueError for a limit that is negative, or that the agent was
-    not trained for and cannot be told.
+    start in the same states under every limit. With `held_out`, they start in states that no other evaluation
+    plays. The rows do not depend on the number of workers. With `seeds`, only the runs with these seeds play.
+    Raises ValueError for a limit that is negative, or that the agent was not trained for and cannot be told.
     """
     jobs = [
-        (run, limit, range(first, min(first + EPISODES_TOGETHER, episodes)))
+        (run, limit, range(first, min(first + EPISODES_TOGETHER, episodes)), held_out)
         for run, seed in enumerate(agent.seeds)
         if seeds is None or seed in seeds
         for limit in _limits_of(agent, run, limits)
@@ -102,11 +105,12 @@ def _limits_of(agent: Agent, run: int, limits: Sequence[float] | None) -> Sequen
     return [agent.limits[run]]
 
 
-def _evaluate_job(agent: Agent, run: int, limit: float, episodes: range) -> pd.DataFrame:
+def _evaluate_job(agent: Agent, run: int, limit: float, episodes: range, held_out: bool) -> pd.DataFrame:
     seed, threads = agent.seeds[run], torch.get_num_threads()
+    first = 1000 * (seed + 1) + (HELD_OUT_STARTS if held_out else 0)
     torch.set_num_threads(1)  # the products are small: more threads are slower
     try:
-        played = rollout(agent, limit, [1000 * (seed + 1) + episode for episode in episodes], run)
+        played = rollout(agent, limit, [first + episode for episode in episodes], run)
     finally:
         torch.set_num_threads(threads)
     return pd.DataFrame(

@@ -57,6 +57,29 @@ def summarise(
     return pd.DataFrame(rows)
 
 
+def certificate(results: pd.DataFrame) -> pd.DataFrame:
+    """Returns what raw results prove of each run and limit: one row per task, algorithm, seed and threshold.
+
+    `cost` is the mean cost of an episode, and `cost_low` and `cost_high` are its 95% interval by Student's t.
+    `exceeds` is the share of episodes that cost more than the limit, and `exceeds_low` and `exceeds_high` are
+    the exact 95% interval of its chance (Clopper and Pearson 1934). `predicted` is the mean cost that the
+    run's critics predicted at the first step, or NaN. Costs are in unsafe steps per episode.
+    """
+    rows = []
+    by = ["task", "algorithm", "seed", "threshold"]
+    for key, part in results.groupby(by, sort=False):
+        costs, limit = part["cost"].to_numpy(), key[-1]
+        over = stats.binomtest(int((costs > limit).sum()), len(costs)).proportion_ci(0.95, "exact")
+        half = stats.t.ppf(0.975, len(costs) - 1) * stats.sem(costs) if len(costs) > 1 else np.inf
+        rows.append(
+            dict(zip(by, key, strict=True))
+            | {"episodes": len(costs), "cost": costs.mean(), "predicted": part["predicted_cost"].mean()}
+            | {"cost_low": max(costs.mean() - half, 0.0), "cost_high": costs.mean() + half}
+            | {"exceeds": (costs > limit).mean(), "exceeds_low": over.low, "exceeds_high": over.high}
+        )
+    return pd.DataFrame(rows)
+
+
 def _interval(values: np.ndarray) -> tuple[float, float]:
     if len(values) < 2 or np.ptp(values) == 0:
         return float(values.mean()), float(values.mean())

@@ -2,151 +2,133 @@
 
 import warnings
 from pathlib import Path
+from typing import NamedTuple
 
 import h5py
 import numpy as np
 
+from tutorial_lib.data import layout
+from tutorial_lib.data.checks import Report, check_dataset, check_shapes, check_task, check_values
 from tutorial_lib.data.dataset import KEYS, Dataset, DatasetError
 from tutorial_lib.files import written_whole
-from tutorial_lib.tasks import TASKS, Task, as_task
+from tutorial_lib.tasks import Task, as_task
 
-FLAGS = ("terminals", "timeouts")
-CHUNK_ROWS = 16384
-STORAGE = {"compression": "gzip", "compression_opts": 9, "shuffle": True}
-"""How arrays are stored. A chunk holds one column of `CHUNK_ROWS` rows, and its bytes are shuffled: similar
-bytes are then neighbours, which gzip compresses well. CarCircle's file has 72% of the raw size. It has 75%
-with chunks of whole rows, and 87% with whole rows and no shuffle."""
+ROUNDED = ("observations", "next_observations", "actions", "rewards")
 
 
 def read_dataset(path: Path | str, task: Task | str) -> Dataset:
     """The dataset in a file in DSRL's layout, after checks.
 
     Arrays of shape (N,) may be stored as (N, 1). Other keys of the file are ignored. Rows after the last end
-    of an episode are dropped, and a warning says how many they are.
+    of an episode are dropped, and a warning says how many they are. There are also warnings for what
+    contradicts the task but may be meant (see `checks`).
 
-    Raises DatasetError for a file that is missing, empty, truncated, not HDF5, or of another task; for keys
-    that are missing or have the wrong shape for the task; for episodes longer than the task's horizon; for
-    values that are NaN or infinite, flags that are not 0 or 1, and negative costs; and where no episode ends.
+    Raises DatasetError, and no other error, for a file that cannot be opened or is damaged; for arrays that
+    are missing, that are stored outside the file, or that have the wrong shape or type for the task; for
+    values that no dataset has, and for flags, rows and values with which training would be wrong.
     """
-    path, task = Path(path), as_task(task)
-    stored, attributes = _read_hdf5(path)
-    arrays = _check_arrays(stored, task, path)
-    _check_task(attributes, task, path)
-    rows = len(arrays["rewards"])
-    ends = np.flatnonzero(arrays["terminals"] | arrays["timeouts"]) + 1
-    if not len(ends):
-        raise DatasetError(
-            f"{path}: terminals, timeouts: none of the {rows} transitions ends an episode: "
-            "set timeouts to 1 where the horizon was reached"
-        )
-    kept = ends[-1]
-    if kept < rows:
-        warnings.warn(f"{path}: unfinished tail: dropped {rows - kept} of {rows} transitions", stacklevel=2)
-    dataset = Dataset(**{key: values[:kept] for key, values in arrays.items()}, attributes=attributes)
-    longest = dataset.episode_lengths.max()
-    if longest > task.horizon:
-        what = f"an episode of {longest} steps, but {task.name} has {task.horizon}"
-        raise DatasetError(f"{path}: timeouts: {what}: is it another task's?")
+    dataset, report = examine(path, task)
+    if dataset is None or report.errors:
+        raise DatasetError(_first(report))
+    for warning in report.warnings:
+        warnings.warn(warning, stacklevel=2)
     return dataset
 
 
+class Examined(NamedTuple):
+    """What `examine` finds in a file."""
+
+    dataset: Dataset | None
+    """None where the values cannot be read, or do not make a dataset."""
+    report: Report
+
+
+def examine(path: Path | str, task: Task | str) -> Examined:
+    """The dataset in a file, also where `read_dataset` would refuse it, and all that is wrong with it."""
+    path, task = Path(path), as_task(task)
+    report = Report(path)
+    stored, attributes = layout.read_arrays(path, task, report)
+    dataset = _whole_episodes(stored, attributes, report) if stored else None
+    check_task(attributes, task, report)
+    if dataset is not None:
+        check_dataset(dataset, task, report)
+    return Examined(dataset, report)
+
+
 def write_dataset(
-    path: Path | str, dataset: Dataset, task: Task | str, attributes: dict | None = None
+    path: Path | str,
+    dataset: Dataset,
+    task: Task | str,
+    attributes: dict | None = None,
+    mantissa_bits: int | None = None,
 ) -> Path:
     """Write `dataset` to a file in DSRL's layout, which `dsrl` 0.1.0 reads. Returns the path.
 
     Five arrays are float32, the two flags are bool. The attributes of the file's root are the dataset's own,
     `attributes` (values of type str, int or float), and the task's name. The file is written whole or not at
-    all: if the program is killed, the old file stays as it was. Equal datasets give equal bytes. Raises
-    DatasetError where `read_dataset` would, before anything is written.
+    all: if the program is killed, the old file stays as it was. Equal datasets give equal bytes.
+
+    With `mantissa_bits` from 1 to 22, observations, next observations, actions and rewards are rounded to
+    numbers of so many bits after the leading one. A float32 has 23. The file is then smaller. Its attributes
+    `mantissa_bits` and `largest_rounding_error` say so.
+
+    Raises DatasetError where `read_dataset` would, before anything is written, and ValueError for another
+    number of bits.
     """
     path, task = Path(path), as_task(task)
-    arrays = _check_arrays({key: getattr(dataset, key) for key in KEYS}, task, path)
-    _check_task(dataset.attributes, task, path)
+    attributes = dataset.attributes | (attributes or {}) | {"task": task.name}
+    arrays, report = {key: getattr(dataset, key) for key in KEYS}, Report(path)
+    if check_shapes(arrays, task, report):
+        arrays = check_values(arrays, report)
+    check_task(dataset.attributes, task, report)
+    if not report.errors:
+        check_dataset(Dataset(**arrays), task, report)
+    if report.errors:
+        raise DatasetError(_first(report))
+    if mantissa_bits is not None:
+        exact = arrays
+        arrays = {key: rounded(x, mantissa_bits) if key in ROUNDED else x for key, x in exact.items()}
+        largest = max(float(np.abs(arrays[key] - exact[key]).max()) for key in ROUNDED)
+        attributes |= {"mantissa_bits": mantissa_bits, "largest_rounding_error": largest}
     with written_whole(path) as temporary, h5py.File(temporary, "w") as file:
-        file.attrs.update(dataset.attributes | (attributes or {}) | {"task": task.name})
-        for key, values in arrays.items():
-            chunks = (min(CHUNK_ROWS, len(values)),) + (1,) * (values.ndim - 1)
-            file.create_dataset(key, data=values, chunks=chunks, **STORAGE)
+        file.attrs.update(attributes)
+        layout.write_arrays(file, arrays)
     return path
 
 
-def _read_hdf5(path: Path) -> tuple[dict, dict]:
-    """The arrays that the file has under DSRL's keys, and the attributes of its root. Raises DatasetError."""
-    again = "delete it, then fetch or collect it again"
-    if not path.is_file():
-        raise DatasetError(f"{path}: no such file: check the path")
-    if not path.stat().st_size:
-        raise DatasetError(f"{path}: the file is empty (0 bytes): {again}")
-    if not h5py.is_hdf5(path):
-        raise DatasetError(f"{path}: not an HDF5 file, or its first bytes are lost: {again}")
-    arrays, key = {}, "file"
-    try:
-        with h5py.File(path, "r") as file:
-            attributes = {k: v.item() if isinstance(v, np.generic) else v for k, v in file.attrs.items()}
-            for key in KEYS:
-                if isinstance(file.get(key), h5py.Dataset):
-                    arrays[key] = file[key][()]
-    except (OSError, RuntimeError, KeyError) as error:
-        reason = " ".join(str(error).split())
-        raise DatasetError(f"{path}: {key}: truncated or damaged: {again} ({reason})") from error
-    return arrays, attributes
+def rounded(values: np.ndarray, mantissa_bits: int) -> np.ndarray:
+    """float32 values, each replaced by the nearest that has `mantissa_bits` bits after the leading one.
 
-
-def _check_task(attributes: dict, task: Task, path: Path) -> None:
-    """Raises DatasetError where the attribute `task` or the file's name names another task.
-
-    DSRL's files have no such attribute, so that only the name can tell.
+    Of two equally near ones, the last bit of the result is 0. The relative error is at most
+    2^-(mantissa_bits + 1). Raises ValueError where `mantissa_bits` is not between 1 and 22.
     """
-    # The shapes cannot tell: BallRun and CarRun have the same.
-    of_names = {other.dsrl_file: other.name for other in TASKS.values()}
-    for what, made_for in (
-        ("attribute task", str(attributes.get("task", task.name))),
-        ("its name", of_names.get(path.name, task.name)),
-    ):
-        if made_for in TASKS and made_for != task.name:
-            raise DatasetError(f"{path}: {what}: {made_for}, not {task.name}: take another task or file")
+    if not 1 <= mantissa_bits <= 22:
+        raise ValueError(f"mantissa_bits is {mantissa_bits}, and must be between 1 and 22")
+    dropped = 23 - mantissa_bits
+    bits = np.ascontiguousarray(values, np.float32).view(np.uint32)
+    # Adding just under half of the last kept bit carries into it where the rest is more than half, and for
+    # exactly half where the last kept bit is 1. A carry out of the mantissa rightly raises the exponent.
+    bits = bits + np.uint32((1 << dropped - 1) - 1) + (bits >> np.uint32(dropped) & np.uint32(1))
+    return (bits & np.uint32(0xFFFFFFFF << dropped & 0xFFFFFFFF)).view(np.float32)
 
 
-def _check_arrays(stored: dict, task: Task, path: Path) -> dict[str, np.ndarray]:
-    """The seven arrays with the shapes and types of a Dataset. Raises DatasetError, which names the key."""
-    missing = [key for key in KEYS if key not in stored]
-    if missing:
-        raise DatasetError(f"{path}: {', '.join(missing)}: missing: DSRL's layout has {', '.join(KEYS)}")
-    rows = np.shape(stored["observations"])[:1]
-    if rows == (0,):
-        raise DatasetError(f"{path}: observations: 0 rows, no transitions: fetch or collect some")
-    obs, act = (task.obs_dim,), (task.act_dim,)
-    widths = {"observations": obs, "next_observations": obs, "actions": act}
-    checked = {}
-    for key in KEYS:
-        values, shape = np.asarray(stored[key]), rows + widths.get(key, ())
-        if key not in widths and values.shape == (*shape, 1):
-            values = values[:, 0]
-        if values.shape != shape:
-            what = f"shape {values.shape} should be {shape} for {task.name}"
-            raise DatasetError(f"{path}: {key}: {what}: is it another task's, or shorter than observations?")
-        checked[key] = _check_values(values, key, path)
-    return checked
+def _whole_episodes(stored: dict[str, np.ndarray], attributes: dict, report: Report) -> Dataset | None:
+    """The rows up to the last end of an episode. None where the report has an error."""
+    arrays = check_values(stored, report)
+    rows = len(arrays["rewards"])
+    ends = np.flatnonzero(arrays["terminals"] | arrays["timeouts"]) + 1
+    if not len(ends):
+        what = f"none of the {rows} transitions ends an episode"
+        report.error("terminals, timeouts", what, "set timeouts to 1 where the horizon was reached")
+    if report.errors:
+        return None
+    kept = ends[-1]
+    if kept < rows:
+        report.warning("unfinished tail", f"dropped {rows - kept} of {rows} transitions", "")
+    return Dataset(**{key: values[:kept] for key, values in arrays.items()}, attributes=attributes)
 
 
-def _check_values(values: np.ndarray, key: str, path: Path) -> np.ndarray:
-    """The values of one array, as bool for flags and as float32 for others. Raises DatasetError."""
-
-    def refuse(bad: np.ndarray, what: str, remedy: str) -> None:
-        rows = np.flatnonzero(bad.reshape(len(bad), -1).any(axis=1))
-        if len(rows):
-            count = f"{len(rows)} of {len(bad)} rows, the first is row {rows[0]}"
-            raise DatasetError(f"{path}: {key}: {what} in {count}: {remedy}")
-
-    if values.dtype.kind not in "biuf":
-        raise DatasetError(f"{path}: {key}: {values.dtype} is not a number: store float32, or bool for flags")
-    if key in FLAGS:
-        refuse((values != 0) & (values != 1), "neither 0 nor 1", "store False or True")
-        return values.astype(bool)
-    with np.errstate(over="ignore"):  # a value too large for float32 becomes infinite, and is refused below
-        values = values.astype(np.float32, copy=False)
-    refuse(~np.isfinite(values), "NaN or infinity", "leave those episodes out")
-    if key == "costs":
-        refuse(values < 0, "negative cost", "make costs 0 or more")
-    return values
+def _first(report: Report) -> str:
+    """The first error, and how many more there are."""
+    more = len(report.errors) - 1
+    return report.errors[0] + (f" (and {more} more: `c2iql data check` lists them)" if more else "")

@@ -83,11 +83,6 @@ def episode_files(folder: Path) -> list[Path]:
     return sorted(folder.glob("episodes-*.safetensors"))
 
 
-def seconds_taken(folder: Path) -> float:
-    """The seconds that a run has taken so far. Raises ValueError where no slice is finished."""
-    return float(load_file(max(folder.glob("state-*.safetensors")))["seconds"])
-
-
 def _state_path(folder: Path, slices: int) -> Path:
     """The state after this many slices.
 

@@ -1,5 +1,7 @@
 """Finds datasets (shipped with the project, DSRL's own, or at a path), and downloads DSRL's."""
 
+import contextlib
+import functools
 import hashlib
 import os
 import shutil
@@ -13,14 +15,57 @@ from tutorial_lib.tasks import TASKS, Task, as_task
 DSRL_URL = "https://huggingface.co/datasets/YYY-45/DSRL/resolve/main/"
 SHIPPED_DATA = Path(__file__).resolve().parents[2] / "data"
 """The folder of the datasets, agents and results that are shipped with the project."""
+CHECKSUMS = "checksums.txt"
+"""The file in `SHIPPED_DATA` with the SHA-256 of every dataset, in the format of `sha256sum`."""
 
 
 def load_dataset(task: Task | str, source: Path | str = "shipped") -> Dataset:
     """The dataset of a task, read from `source` (see `find_dataset`).
 
-    Raises DatasetError where there is no file, or `read_dataset` refuses it.
+    A shipped file is compared with its SHA-256 in `checksums.txt` when a process first reads it. Raises
+    DatasetError where there is no file, where the SHA-256 differs, or where `read_dataset` refuses the file.
     """
-    return read_dataset(find_dataset(task, source), task)
+    path = find_dataset(task, source)
+    checksums = SHIPPED_DATA / CHECKSUMS
+    if path.resolve().parent == SHIPPED_DATA.resolve() and checksums.is_file():
+        with contextlib.suppress(OSError):  # `read_dataset` says why the file cannot be opened
+            _verify_shipped(path, path.stat().st_mtime_ns, checksums.read_text())
+    return read_dataset(path, task)
+
+
+@functools.cache
+def _verify_shipped(path: Path, changed: int, checksums: str) -> None:
+    """Raises DatasetError where the SHA-256 of a file is not its own in the text `checksums`, if it has one.
+
+    The bytes of the file are hashed and not its values: they are fewer, and include the file's structure,
+    where a flipped bit can give other values or attributes. `changed` is when the file was last changed.
+    """
+    lines = (line.partition("  ") for line in checksums.splitlines())
+    wanted = {name: digest for digest, _, name in lines}.get(path.name)
+    if wanted and (digest := _sha256(path)) != wanted:
+        remedy = "restore it from git, or call sources.write_checksums() if you replaced it yourself"
+        raise DatasetError(
+            f"{path}: file: damaged: SHA-256 is {digest}, but {CHECKSUMS} has {wanted}: {remedy}"
+        )
+
+
+def write_checksums() -> Path:
+    """Write the SHA-256 of the datasets in `SHIPPED_DATA` to its `checksums.txt`. Returns the path.
+
+    Call it whenever a shipped dataset is replaced: `python -c "from tutorial_lib.data import sources;
+    sources.write_checksums()"`. In the folder, `sha256sum -c checksums.txt` compares them, too.
+    """
+    path = SHIPPED_DATA / CHECKSUMS
+    files = sorted(SHIPPED_DATA.glob("*.hdf5"))
+    with written_whole(path) as temporary:
+        temporary.write_text("".join(f"{_sha256(file)}  {file.name}\n" for file in files))
+    return path
+
+
+def _sha256(file: Path) -> str:
+    """The SHA-256 of a file's bytes, in hexadecimal."""
+    with open(file, "rb") as content:
+        return hashlib.file_digest(content, "sha256").hexdigest()
 
 
 def find_dataset(task: Task | str, source: Path | str = "shipped") -> Path:
@@ -39,9 +84,11 @@ def find_dataset(task: Task | str, source: Path | str = "shipped") -> Path:
         path = dsrl_directory() / task.dsrl_file
         remedy = f"no such file: {fetch}, or set DSRL_DATASET_DIR to the folder that has it"
     else:
-        path = Path(source).expanduser()
+        path = Path(source)
+        with contextlib.suppress(RuntimeError):  # ~NAME where there is no such user
+            path = path.expanduser()
         remedy = f"no such file: check the path, or use source 'shipped' or 'dsrl' ({fetch})"
-    if not path.is_file():
+    if not os.path.isfile(path):  # False also where the folder may not be looked into
         raise DatasetError(f"{path}: {remedy}")
     return path
 
@@ -99,8 +146,7 @@ def fetch_dataset(task: Task | str, directory: Path | str | None = None, base_ur
 
 def _verify(file: Path, memory: Path, task: Task) -> str:
     """The SHA-256 of a file. Raises DatasetError where it is not the stored one or the data are unusable."""
-    with open(file, "rb") as content:
-        digest = hashlib.file_digest(content, "sha256").hexdigest()
+    digest = _sha256(file)
     remembered = _remembered(memory) or digest
     if digest != remembered:
         remedy = f"delete it to fetch it again, or delete {memory.name} to accept it"
