@@ -1,4 +1,6 @@
-"""Behaviour cloning: its loss by a loop, what it clones, and which episodes the safe one sees."""
+"""Behaviour cloning: its losses by loops, what it clones, which episodes it sees, and what it is told."""
+
+import dataclasses
 
 import numpy as np
 import pytest
@@ -110,3 +112,94 @@ def test_saved_loaded_and_evaluated_like_any_agent(tmp_path):
         results = evaluate(load_agent(tmp_path / "agent.safetensors"), episodes=1)
         assert sorted(set(results["threshold"])) == limits and set(results["seed"]) == {0, 4}
         assert set(results["algorithm"]) == {name} and results["predicted_cost"].isna().all()
+
+
+# --- BC-Frontier ---
+
+
+def earning(returns, costs, length=100):
+    """The dataset with these costs whose episodes earn `returns`, each in its last step."""
+    rewards = np.zeros((len(costs), length), np.float32)
+    rewards[:, -1] = returns
+    return dataclasses.replace(make_dataset(costs, length), rewards=rewards.ravel())
+
+
+@pytest.mark.parametrize("frontier_range", [0.0, 0.1, 0.3])
+def test_frontier_keeps_what_earns_nearly_the_best_at_its_cost(frontier_range):
+    rng = np.random.default_rng(3)
+    costs, returns = rng.integers(0, 100, 60), rng.normal(50, 30, 60)
+    returns = (returns + costs).astype(np.float32)
+    kept = []
+    for cost, total in zip(costs, returns, strict=True):
+        best = max(r for c, r in zip(costs, returns, strict=True) if c <= cost)
+        if total >= best - frontier_range * (max(returns) - min(returns)):
+            kept.append((cost, total))
+    agent = make_agent("BC-Frontier", frontier_range=frontier_range)
+    found = agent.select(earning(returns, costs), np.inf)
+    assert 0 < len(kept) < 60
+    assert list(zip(found.episode_costs, found.episode_returns, strict=True)) == kept
+
+
+def test_frontier_clones_those_episodes_alone():
+    agent = make_agent("BC-Frontier")
+    train(agent, earning([1, 2, 0, 1], (10, 30, 60, 80)), progress=False)  # the dear ones earn less
+    assert np.abs(taken(agent) - CHEAP).mean() < 0.15
+
+
+# --- BC (budget rule) ---
+
+BUDGET = "BC (budget rule)"
+
+
+def by_hand(agent, observations, budgets, times):
+    """The policy's actions at normalised observations with two more numbers, one at a time."""
+    weights = {key: value[0].detach() for key, value in agent.parameters["policy"].items()}
+    mean, std = (agent.variables[f"observation_{key}"][0].numpy() for key in ("mean", "std"))
+    actions = []
+    for observation, budget, time in zip(observations, budgets, times, strict=True):
+        numbers = [*(observation - mean) / std, min(budget, 80) / 80, time / 100]  # BallRun's range and T
+        x = torch.tensor(np.array([numbers]), dtype=torch.float32)
+        actions.append(functional_call(agent.modules["policy"], weights, x)[0][0].numpy(force=True))
+    return np.array(actions)
+
+
+def test_the_budget_rule_learns_from_the_cost_that_is_still_to_come():
+    agent, data = make_agent(BUDGET), make_dataset()
+    agent.prepare([data], progress=False)
+    batch = agent.draw(data.tensors(), torch.Generator().manual_seed(0), np.inf)
+    total = 0.0
+    for b in range(64):
+        (row,) = np.flatnonzero((data.observations == batch["observations"][b].numpy()).all(1))
+        still = data.costs[row : (row // 100 + 1) * 100].sum()
+        action = by_hand(agent, data.observations[row : row + 1], [still], [row % 100])[0]
+        total += ((action - data.actions[row]) ** 2).sum()
+    scalars = agent.update({name: value[None] for name, value in batch.items()})
+    assert scalars["policy_loss"].item() == pytest.approx(total / 128, rel=1e-4)
+
+
+def test_the_budget_rule_is_told_what_is_left_and_the_time():
+    agent = make_agent(BUDGET)
+    agent.prepare([make_dataset()], progress=False)
+    limits = np.array([1.0, 5.0, np.inf])
+    player, rng = agent.player(limits, [0, 1, 2]), np.random.default_rng(0)
+    left = limits.copy()
+    for t in range(8):
+        observations = rng.normal(size=(3, TASK.obs_dim))
+        np.testing.assert_array_equal(player.told, np.maximum(left, 0))
+        expected = by_hand(agent, observations, np.maximum(left, 0), [t] * 3)
+        np.testing.assert_allclose(player.act(observations), expected, atol=1e-5)
+        costs = np.array([1.0, t % 2, 1.0])
+        player.see(np.zeros(3), costs)
+        left = left - costs
+    assert left[0] < 0 < left[1]
+
+
+def test_told_little_it_clones_the_cheap_and_told_much_the_dear():
+    agent = make_agent(BUDGET, policy_lr=1e-2, updates=600)
+    train(agent, make_dataset(costs=(0, 100, 0, 100)), progress=False)
+    player, rng, missed = agent.player([0.0, 100.0], [0, 1]), np.random.default_rng(0), []
+    for _ in range(80):  # after that both have little left
+        actions = player.act(rng.normal(size=(2, TASK.obs_dim)))
+        missed.append(np.abs(actions - [CHEAP, DEAR]))
+        player.see(np.zeros(2), np.array([0.0, 1.0]))
+    assert np.mean(missed, 0).max() < 0.2

@@ -469,8 +469,8 @@ def write_run(folder, slices, first_tag):
             steps = max(3, cost) if terminal else ANT.horizon
             for step in range(steps):
                 last = step == steps - 1
-                rows["observations"].append([tag + step / 1000] * 33)
-                rows["next_observations"].append([tag + (step + 1) / 1000] * 33)
+                rows["observations"].append([tag + step / 10] * 33)
+                rows["next_observations"].append([tag + (step + 1) / 10] * 33)
                 rows["actions"].append([0.1, -0.1] * 4), rows["rewards"].append(tag / 1000)
                 rows["costs"].append(float(step < cost))
                 rows["terminals"].append(last and terminal), rows["timeouts"].append(last and not terminal)
@@ -498,7 +498,7 @@ def test_the_episodes_of_a_source_stand_together_in_the_order_of_sources(sources
 
     tags = {"priced-0": [100, 101, 103, 105], "lagrangian-7": [], "priced-2": [300, 302, 303]}
     assert made.observations[made.starts, 0].tolist() == [tag for source in sources for tag in tags[source]]
-    last = made.observations[made.ends - 1, 0] - (made.episode_lengths - 1) / 1000
+    last = made.observations[made.ends - 1, 0] - (made.episode_lengths - 1) / 10
     assert last == pytest.approx(made.observations[made.starts, 0], abs=0.02)  # rounded
     assert json.loads(made.attributes["episodes_by_source"]) == {s: len(tags[s]) for s in sources}
     assert list(json.loads(made.attributes["episodes_by_source"])) == list(sources)

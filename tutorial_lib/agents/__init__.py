@@ -3,16 +3,40 @@
 To add an algorithm, write its file and add its class to `ALGORITHMS`.
 """
 
+import re
+
 from tutorial_lib.agents.agent import Agent
-from tutorial_lib.agents.bc import BCAll, BCSafe
+from tutorial_lib.agents.bc import BCAll, BCBudget, BCFrontier, BCSafe
+from tutorial_lib.agents.bcq import BCQLag
+from tutorial_lib.agents.bear import BEARLag
 from tutorial_lib.agents.c2iql import C2IQL, C2IQLWithoutCC, C2IQLWithoutCR
+from tutorial_lib.agents.cdt import CDT
 from tutorial_lib.agents.ciql import CIQL
+from tutorial_lib.agents.coptidice import COptiDICE
 from tutorial_lib.agents.cpq import CPQ, PushedCPQ
+from tutorial_lib.agents.fisor import FISOR
 from tutorial_lib.agents.iql import IQL
 
 ALGORITHMS: dict[str, type[Agent]] = {
     agent.name: agent
-    for agent in (IQL, CIQL, C2IQLWithoutCR, C2IQLWithoutCC, C2IQL, BCAll, BCSafe, CPQ, PushedCPQ)
+    for agent in (
+        IQL,
+        CIQL,
+        C2IQLWithoutCR,
+        C2IQLWithoutCC,
+        C2IQL,
+        BCAll,
+        BCSafe,
+        BCFrontier,
+        BCBudget,
+        CPQ,
+        PushedCPQ,
+        COptiDICE,
+        FISOR,
+        CDT,
+        BCQLag,
+        BEARLag,
+    )
 }
 """The class of every algorithm, by its name."""
 
@@ -27,4 +51,4 @@ def get_algorithm(name: str) -> type[Agent]:
 
 def slug(name: str) -> str:
     """Returns a name as the command line and folders write it, e.g. C2IQL-wo-CR for 'C2IQL w/o CR'."""
-    return name.replace(" ", "-").replace("/", "")
+    return re.sub(r"[^\w-]", "", name.replace(" ", "-"))
