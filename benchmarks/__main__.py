@@ -7,7 +7,7 @@ import tyro
 
 from benchmarks import PARTS, bench, install, pages
 from benchmarks import full as measure_all
-from tutorial_lib.__main__ import Device, check_counts, check_device
+from tutorial_lib.commands import Device, check_counts, check_device
 from tutorial_lib.tasks import Task, get_task
 
 

@@ -55,6 +55,27 @@ def test_an_agent_remembers_its_data(dataset, tmp_path):
     assert load_agent(path).data_checksum == dataset.checksum
 
 
+def test_equal_agents_are_equal_files_and_other_agents_are_not(tmp_path):
+    """The library writes metadata in a random order: of twelve files, two would differ almost surely."""
+    agent = make_agent("C2IQL")
+    for number in range(12):
+        save_agent(agent, tmp_path / f"{number}.safetensors")
+    save_agent(make_agent("C2IQL", seeds=(1,)), tmp_path / "other")
+    files = {path.read_bytes() for path in tmp_path.glob("*.safetensors")}
+    assert len(files) == 1 and (tmp_path / "other").read_bytes() not in files
+
+
+@pytest.mark.skipif(not os.path.exists("/proc/self/maps"), reason="Linux lists there what is mapped")
+def test_no_file_stays_mapped_after_a_resume(dataset, tmp_path):
+    """Windows cannot replace a file that is mapped, and the next checkpoint replaces the last one."""
+    train(make_agent(), dataset, updates=20, run_dir=tmp_path, **EVERY)
+    agent = make_agent()
+    train(agent, dataset, updates=40, run_dir=tmp_path, **EVERY)
+    loaded = load_agent(tmp_path / "checkpoint.safetensors")
+    with open("/proc/self/maps") as maps:
+        assert str(tmp_path) not in maps.read() and agent.updates == loaded.updates == 40
+
+
 def test_without_reconstruction_none_is_saved():
     assert not [name for name in make_agent("C2IQL w/o CR").state() if name.startswith("reconstruction")]
 
@@ -94,16 +115,20 @@ def agent_file(tmp_path_factory):
     return path
 
 
-def rewritten(source, path, header=None, drop="", cut=""):
-    """A copy with entries of the header changed, tensors left out, or tensors cut short."""
+def rewritten(source, path, header=None, drop="", cut="", config=None, **changed):
+    """A copy with entries of the header or options changed, tensors left out, cut short, changed or added."""
     with safe_open(source, "pt") as file:
         metadata = file.metadata() | (header or {})
+    if config:
+        metadata["config"] = json.dumps(json.loads(metadata["config"]) | config)
     tensors = tensors_in(source)
     for key, value in list(tensors.items()):
         if cut and key.startswith(cut):
             tensors[key] = value[..., :-1].contiguous()
         if drop and key.startswith(drop):
             del tensors[key]
+    for key, change in changed.items():
+        tensors[key] = change(tensors.get(key)).contiguous()
     save_file(tensors, path, metadata={key: value for key, value in metadata.items() if value is not None})
 
 
@@ -130,6 +155,37 @@ DAMAGE = {
     "narrow network": lambda source, path: rewritten(source, path, cut="online.policy.net.0.weight"),
     "narrow variable": lambda source, path: rewritten(source, path, cut="variable.observation_mean"),
     "narrow reconstruction": lambda source, path: rewritten(source, path, cut="reconstruction.net"),
+    "an option is missing": lambda source, path: rewritten(source, path, {"config": '{"profile": "paper"}'}),
+    "an unknown entry": lambda source, path: rewritten(source, path, {"colour": "red"}),
+    "an unknown tensor": lambda source, path: rewritten(source, path, colour=lambda x: torch.zeros(2)),
+    "options that are a list": lambda source, path: rewritten(source, path, {"config": "[1]"}),
+    "a nest of lists": lambda source, path: rewritten(source, path, {"config": "[" * 100_000}),
+    "seeds that are text": lambda source, path: rewritten(source, path, {"seeds": '["0", "1"]'}),
+    "a seed of 65 bits": lambda source, path: rewritten(source, path, {"seeds": f"[0, {2**64}]"}),
+    "no whole numbers": lambda source, path: rewritten(source, path, {"seeds": "[0.5, 1]"}),
+    "data that are a number": lambda source, path: rewritten(source, path, {"data": "7"}),
+    "a pipe": lambda source, path: os.mkfifo(path),
+    "float64": lambda source, path: rewritten(source, path, **{"variable.reward_scale": torch.Tensor.double}),
+    "negative updates": lambda source, path: rewritten(source, path, updates=lambda x: x - 1),
+    "many updates": lambda source, path: rewritten(source, path, updates=lambda x: x.repeat(2)),
+    "a moment of another shape": lambda source, path: rewritten(
+        source, path, **{"adam.0.exp_avg": lambda x: torch.zeros(1), "adam.0.step": lambda x: torch.zeros(())}
+    ),
+}
+NOT_FINITE = {
+    f"{value} in {name}": (name, value)
+    for name in ("online.policy.net.0.weight", "variable.observation_std", "reconstruction.whiten")
+    for value in (float("nan"), float("inf"), float("-inf"))
+}
+ABSURD = {
+    "a million runs": {"header": {"seeds": json.dumps(list(range(1_000_000)))}},
+    "a wide network": {"config": {"hidden_width": 10**9}},
+    "a network of 10 million units": {"config": {"hidden_width": 10**7}},
+    "a deep network": {"config": {"hidden_layers": 10**5}},
+    "a deeper network": {"config": {"hidden_layers": 10**12}},
+    "many critics": {"config": {"cost_critics": 10**6}},
+    "a wide reconstruction": {"config": {"crm_width": 10**7}},
+    "a deep reconstruction": {"config": {"crm_layers": 10**6}},
 }
 
 
@@ -139,6 +195,31 @@ def test_a_file_that_is_no_agent_is_one_line_of_error(damage, agent_file, tmp_pa
     DAMAGE[damage](agent_file, path)
     with pytest.raises(TrainingError) as error:
         load_agent(path)
+    assert "\n" not in str(error.value) and str(path) in str(error.value)
+
+
+@pytest.mark.parametrize("where", NOT_FINITE)
+def test_an_agent_with_a_number_that_is_not_finite_is_refused(where, agent_file, tmp_path):
+    path, (name, value) = tmp_path / "agent.safetensors", NOT_FINITE[where]
+
+    def poisoned(tensor):
+        tensor.flatten()[-1] = value
+        return tensor
+
+    rewritten(agent_file, path, **{name: poisoned})
+    with pytest.raises(TrainingError, match=f"{name} has values that are NaN or infinite"):
+        load_agent(path)
+
+
+@pytest.mark.parametrize("size", ABSURD)
+def test_a_size_that_the_tensors_do_not_have_takes_no_memory(size, agent_file, tmp_path):
+    resource = pytest.importorskip("resource", reason="measures memory")
+    path = tmp_path / "agent.safetensors"
+    rewritten(agent_file, path, **ABSURD[size])
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(TrainingError) as error:
+        load_agent(path)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 300_000  # in KB on Linux
     assert "\n" not in str(error.value) and str(path) in str(error.value)
 
 
@@ -203,7 +284,11 @@ def test_a_run_does_not_go_on_with_other_data(dataset, tmp_path):
     assert load_agent(tmp_path / "checkpoint.safetensors").data_checksum == dataset.checksum
 
 
-@pytest.mark.parametrize("damage", ["no metrics", "metrics cut off", "an agent as checkpoint"])
+LOST = ["no metrics", "metrics cut off", "metrics of others", "an agent as checkpoint"]
+LOST += ["target.critics.", "adam.0.", "generator."]
+
+
+@pytest.mark.parametrize("damage", LOST)
 def test_a_folder_that_has_lost_something_is_refused(damage, dataset, tmp_path):
     agent = make_agent()
     train(agent, dataset, updates=10, run_dir=tmp_path, **EVERY)
@@ -211,6 +296,11 @@ def test_a_folder_that_has_lost_something_is_refused(damage, dataset, tmp_path):
         save_agent(agent, tmp_path / "checkpoint.safetensors")
     elif damage == "no metrics":
         (tmp_path / "metrics.csv").unlink()
+    elif damage == "metrics of others":
+        (tmp_path / "metrics.csv").write_text("a,b\n1,2\n")
+    elif damage.endswith("."):
+        (tmp_path / "checkpoint.safetensors").rename(tmp_path / "whole")
+        rewritten(tmp_path / "whole", tmp_path / "checkpoint.safetensors", drop=damage)
     else:
         os.truncate(tmp_path / "metrics.csv", os.path.getsize(tmp_path / "metrics.csv") - 20)
     with pytest.raises(TrainingError) as error:

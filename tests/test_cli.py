@@ -217,14 +217,14 @@ def test_it_runs_as_a_module():
 )
 def test_an_error_is_one_line(arguments, message, c2iql):
     status, out, err = c2iql(*arguments)
-    assert status == 1 and out == ""
+    assert status == 2 and out == ""
     assert err.startswith("c2iql: ") and message in err and err.count("\n") == 1
 
 
 def test_a_machine_without_cuda_says_so(c2iql, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     status, _, err = c2iql("train", "BallRun", "--device", "cuda")
-    assert status == 1 and err.startswith("c2iql: --device cuda") and err.count("\n") == 1
+    assert status == 2 and err.startswith("c2iql: --device cuda") and err.count("\n") == 1
 
 
 @pytest.mark.parametrize("arguments", [[], ["learn"], ["train"], ["train", "CIQL"], ["evaluate"]])
@@ -408,10 +408,18 @@ def test_train_and_evaluate(c2iql, data, tmp_path):
     assert c2iql("evaluate", run / "checkpoint.safetensors", *limits)[0] == 0
     assert sorted(set(pd.read_csv(other)["threshold"])) == [0, 12.5]
     status, _, err = c2iql("evaluate", run / "agent.safetensors", "--limits", -5, "--workers", 1)
-    assert status == 1 and "must be zero or more" in err and err.count("\n") == 1
+    assert status == 2 and "must be zero or more" in err and err.count("\n") == 1
+
+    table = tmp_path / "certificate.csv"
+    certify = ["certify", run / "agent.safetensors", "--limits", 20, 40, "--episodes", 3, "--workers", 1]
+    status, out, err = c2iql(*certify, "--out", table)
+    assert status == 0 and "95% intervals" in out, err
+    rows = pd.read_csv(table)
+    assert rows["threshold"].tolist() == [20, 40] and (rows["episodes"] == 3).all()
+    assert ((rows["exceeds_low"] <= rows["exceeds"]) & (rows["exceeds"] <= rows["exceeds_high"])).all()
 
     status, _, err = c2iql(*train, "--kappa-2", 0.7)  # the folder is another run's
-    assert status == 1 and "is of another run" in err.splitlines()[-1]
+    assert status == 2 and "is of another run" in err.splitlines()[-1]
 
 
 def test_train_and_evaluate_for_limits(c2iql, data, tmp_path):
@@ -429,7 +437,7 @@ def test_train_and_evaluate_for_limits(c2iql, data, tmp_path):
     results = pd.read_csv(tmp_path / "agent-results.csv")
     assert set(zip(results["seed"], results["threshold"], strict=True)) == runs
     status, _, err = c2iql(*evaluate, "--limits", 40)
-    assert status == 1 and "CIQL was trained for the limit 30, 50, 70" in err and err.count("\n") == 1
+    assert status == 2 and "CIQL was trained for the limit 30, 50, 70" in err and err.count("\n") == 1
 
 
 def test_a_folder_is_named_after_what_is_trained(c2iql, data, tmp_path, monkeypatch):
@@ -446,7 +454,7 @@ def test_an_error_in_training_stands_on_a_line_of_its_own(c2iql, data, tmp_path)
     train = ["train", "IQL", "BallRun", "--data", data, "--out", tmp_path, *TINY_NETWORKS, "--updates", 500]
     status, _, err = c2iql(*train, "--critic-lr", 1e30)
     line = err.splitlines()[-1]
-    assert status == 1 and re.match(r"c2iql: \w+_loss is (nan|inf) at update 250 of seed 0: the last", line)
+    assert status == 2 and re.match(r"c2iql: \w+_loss is (nan|inf) at update 250 of seed 0: the last", line)
     assert "Traceback" not in err and "update/s" in err
 
 
@@ -466,7 +474,7 @@ def test_report_of_a_study_says_that_it_was_not_run(c2iql, monkeypatch):
     status, out, _ = c2iql("report", "kappas")
     assert status == 0 and "Not run: `c2iql study kappas` makes it." in out and "no figure" in out
     status, _, err = c2iql("report", "kappa")
-    assert status == 1 and "unknown study 'kappa': the studies are table1" in err
+    assert status == 2 and "unknown study 'kappa': the studies are table1" in err
 
 
 def test_study(c2iql, tmp_path, small_study):
@@ -494,7 +502,7 @@ def test_a_failed_entry_is_reported_and_the_others_are_kept(c2iql, tmp_path, dat
     out_file = tmp_path / "out.csv"
     arguments = ["study", "cloning", "--data", data, "--runs", tmp_path, "--out", out_file]
     status, out, err = c2iql(*arguments)
-    assert status == 1 and "Who copies whom?" in out and "0 of 2 entries" in out
+    assert status == 2 and "Who copies whom?" in out and "0 of 2 entries" in out
     assert re.search(r"FAILED BallRun-BC-All-\w{8}: DatasetError: none", out)
     assert "1 of 2 entries failed" in err and err.count("\n") == 1 and not out_file.exists()
 
@@ -503,4 +511,4 @@ def test_a_folder_that_cannot_be_written_is_one_line_of_error(c2iql, data, tmp_p
     (tmp_path / "file").write_text("")
     train = ["train", "IQL", "BallRun", "--data", data, "--out", tmp_path / "file" / "run"]
     status, _, err = c2iql(*train, *TINY_NETWORKS, "--updates", 1)
-    assert status == 1 and "Traceback" not in err and err.splitlines()[-1].startswith("c2iql: ")
+    assert status == 2 and "Traceback" not in err and err.splitlines()[-1].startswith("c2iql: ")

@@ -70,6 +70,20 @@ def test_a_figure_is_returned_closed_and_in_the_course_style_alone():
     assert figure.axes[0].xaxis.get_ticklabels()[0].get_fontsize() == style.STYLE["font.size"]
 
 
+@pytest.mark.parametrize(
+    "reader",
+    ["dark_background", {"savefig.transparent": True}, {"savefig.dpi": 300}, {"text.usetex": True}],
+    ids=str,
+)
+def test_a_figure_is_the_same_whatever_the_readers_style(reader):
+    task, backend = get_task("BallCircle"), matplotlib.get_backend()
+    expected = figures.budget(played(), task, LIMITS).small_png()
+    with matplotlib.style.context(reader):
+        drawn = figures.budget(played(), task, LIMITS).small_png()
+        assert matplotlib.get_backend() == backend
+    assert drawn == expected
+
+
 def test_a_notebook_stores_a_figure_small_and_true():
     figure = figures.budget(played(), get_task("BallCircle"), LIMITS)
     whole = io.BytesIO()

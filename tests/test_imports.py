@@ -14,7 +14,7 @@ FILES = {
 TREES = {name: ast.parse(path.read_text()) for name, path in FILES.items()}
 FOUNDATION = "config losses networks costs tasks data files style matmul".split()
 LOOPS = "training checkpoints playing scores".split()
-LAYERS = [FOUNDATION, ["agents"], LOOPS, ["options", "studies"], ["course"], ["__main__"]]
+LAYERS = [FOUNDATION, ["agents"], LOOPS, ["options", "studies"], ["course"], ["commands"], ["__main__"]]
 """A module imports from its own layer and from those before it."""
 SHARED = "agent seeds lift player critic implicit lagrangian sequences".split()
 """The files of `agents` that are no algorithm's."""

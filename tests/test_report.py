@@ -73,7 +73,7 @@ def folder(tmp_path, monkeypatch):
                 row |= {"threshold": limit, "return": 204.2873 + score * 370.366, "cost": pay * limit}
                 rows.append(row | {"length": 200, "predicted_cost": 1.0, "updates": 5})
     pd.DataFrame(rows).to_csv(tmp_path / "table1.csv", index=False)
-    noise = [row | {"task": "CarCircle", "threshold": 50, "crm_noise": 0.2} for row in rows[:3]]
+    noise = [row | {"task": "CarCircle", "threshold": 50, "crm_noise": 0.2} for row in rows[:9:3]]
     noise += [row | {"crm_noise": 4.0, "cost": row["cost"] + 5} for row in noise]
     pd.DataFrame(noise).to_csv(tmp_path / "crm-noise.csv", index=False)
     monkeypatch.setattr(report, "load_results", lambda name: load_results(name, tmp_path))
@@ -111,8 +111,31 @@ def test_a_studys_section_has_its_table_figure_and_verdicts_or_says_that_it_was_
         report.write_study("crm")
 
 
+def test_a_damaged_file_of_results_overwrites_nothing(folder, monkeypatch):
+    """The studies before it, in the order of `STUDIES`, are in order, and so are the pages."""
+    page, names = folder / "README.md", list(report.STUDIES)
+    assert names.index("table1") < names.index("kappas") < names.index("crm-noise")
+    monkeypatch.setattr(report, "pages", lambda: {page: "new"})
+    monkeypatch.setattr(report, "shipped_tasks", lambda: ())
+    lines = (folder / "crm-noise.csv").read_text().splitlines()
+    (folder / "kappas.csv").write_text("\n".join(line + ("0" if i else "") for i, line in enumerate(lines)))
+    old = [page, folder / "table1.png", folder / "kappas.png", folder / "crm-noise.png"]
+    for path in old:
+        path.write_text("old")
+    for write in (report.write, lambda: report.write_study("kappas"), lambda: report.study_section("kappas")):
+        with pytest.raises(ValueError, match="kappas.csv: line 7: has no end, so the file was cut off"):
+            write()
+    (folder / "kappas.csv").write_text((folder / "crm-noise.csv").read_text())
+    with pytest.raises(ValueError, match="kappas.csv: line 1: has no column kappa_1, kappa_2"):
+        report.write()
+    assert [path.read_text() for path in old] == ["old"] * 4
+    (folder / "kappas.csv").unlink()
+    assert set(report.write()) == {page, folder / "table1.png", folder / "crm-noise.png"}
+    assert page.read_text() == "new" and old[1].read_bytes()[1:4] == old[3].read_bytes()[1:4] == b"PNG"
+
+
 def test_the_runs_of_profile_paper_stand_beside_profile_small(folder):
-    assert report.paper_profile_table() == "*Not run.*" and report.write_paper_profile() is None
+    assert report.paper_profile_table() == "*Not run.*" and report.paper_profile_figure() is None
     small = load_results("table1", folder)
     paper = small[(small["seed"] == 0) & (small["algorithm"] == "C2IQL")].assign(profile="paper")
     runs = [

@@ -12,6 +12,8 @@ from tutorial_lib.data.sources import load_dataset
 from tutorial_lib.studies.grids import STUDIES, varied_options
 from tutorial_lib.studies.paper import CLAIMS, TABLE1, TABLE1_AVERAGES, TABLE1_STD, TABLE2, Claim
 from tutorial_lib.studies.results import (
+    OWN_COLUMNS,
+    RESULTS,
     against,
     difference,
     kept,
@@ -324,3 +326,134 @@ def test_twelve_algorithms_look_different_and_none_is_left_out():
     names = [f"algorithm {i}" for i in range(12)]
     looks = figures.algorithm_looks(pd.DataFrame({"algorithm": names}))
     assert list(looks) == names and len({(look["color"], look["marker"]) for look in looks.values()}) == 12
+
+
+# --- Files of results ---
+
+
+@pytest.fixture
+def table(tmp_path):
+    """The lines of a file of two runs with two episodes each, and a function that writes and reads it."""
+    make_results([({"kappa_1": 0.5}, 0.5, 0.4)], (0, 1), (30,)).to_csv(tmp_path / "whole.csv", index=False)
+    lines = (tmp_path / "whole.csv").read_text().splitlines(keepends=True)
+
+    def read(data, name="kappas"):
+        path = tmp_path / f"{name}.csv"
+        path.write_bytes(data if isinstance(data, bytes) else "".join(data).encode())
+        return load_results(name, tmp_path)
+
+    return lines, read
+
+
+def with_value(lines, line, column, text):
+    """The lines, of which one (counted from 1) has another value in a column."""
+    names, values = lines[0].strip().split(","), lines[line - 1].strip().split(",")
+    values[names.index(column)] = text
+    return [*lines[: line - 1], ",".join(values) + "\n", *lines[line:]]
+
+
+def without_column(lines, column):
+    place = lines[0].strip().split(",").index(column)
+    rows = [line.strip().split(",") for line in lines]
+    return [",".join(row[:place] + row[place + 1 :]) + "\n" for row in rows]
+
+
+VALUES = {
+    "seed": ["", "low", "nan", "0.5", "-1", "1e999", "1_0", "\u0661"],
+    "threshold": ["low", "nan", "-1", "-inf", ""],
+    "return": ["inf", "-inf", "NaN", "", "None", "0x10", "1,5"],
+    "cost": ["-1", "inf", "nan", "", "low"],
+    "length": ["9.5", "-1"],
+    "predicted_cost": ["nan", "inf", "low"],
+    "task": ["", "CarSquare", "0"],
+    "algorithm": [""],
+    "kappa_1": ["high"],
+}
+FILES = {  # what is wrong: (the file's lines, the line that is named, words of the error)
+    "empty": (lambda x: [], 1, "no end"),
+    "nothing but a line end": (lambda x: ["\n"], 1, "no column task"),
+    "cut off in a line": (lambda x: [*x[:-1], x[-1][:-9]], 5, "cut off"),
+    "cut off between lines": (lambda x: x[:-1], 4, "has 1 episodes, and other runs have 2"),
+    "a line is missing": (lambda x: [*x[:3], *x[4:]], 4, "lines are missing"),
+    "semicolons": (lambda x: [line.replace(",", ";") for line in x], 1, "commas separate columns"),
+    "a line twice": (lambda x: [*x, x[2]], 6, "same episode as line 3"),
+    "all lines twice": (lambda x: [*x, *x[1:]], 6, "same episode as line 2"),
+    "no header": (lambda x: x[1:], 1, "no column"),
+    "a conflict": (
+        lambda x: [*x[:2], "<<<<<<< HEAD\n", x[2], "=======\n", x[2], ">>>>>>> b\n"],
+        3,
+        "conflict",
+    ),
+    "NUL bytes": (lambda x: [*x[:3], "\0" * 50 + "\n"], 4, "NUL"),
+    "nothing but NUL bytes": (lambda x: ["\0" * 500], 1, "NUL"),
+    "other text": (lambda x: "".join(x).replace("C2IQL", "\u00c92IQL").encode("latin-1"), 2, "UTF-8"),
+    "another format": (lambda x: b"\x89PNG\r\n\x1a\n", 1, "UTF-8"),
+    "a value too many": (lambda x: [*x[:3], x[3].strip() + ",7\n", *x[4:]], 4, "values for"),
+    "an empty line": (lambda x: [*x[:3], "\n", *x[3:]], 4, "0 values"),
+    "an open quote": (lambda x: [*x[:2], '"' + x[2], *x[3:]], None, "delimiter|quote|end of data|values"),
+    "a column twice": (lambda x: [x[0].replace("profile", "task"), *x[1:]], 1, "profile"),
+    "an option twice": (
+        lambda x: [x[0].strip() + ",kappa_1\n", *(y.strip() + ",1\n" for y in x[1:])],
+        1,
+        "two",
+    ),
+}
+
+
+def test_a_whole_file_of_results_is_read_as_it_was_written(table):
+    lines, read = table
+    results = make_results([({"kappa_1": 0.5}, 0.5, 0.4)], (0, 1), (30,))
+    pd.testing.assert_frame_equal(read(lines), results)
+    pd.testing.assert_frame_equal(read([line.replace("\n", "\r\n") for line in lines]), results)
+    pd.testing.assert_frame_equal(read("".join(lines).encode("utf-8-sig")), results)
+    assert len(read(lines[:1])) == 0
+    for column, text in (
+        ("predicted_cost", ""),
+        ("threshold", "inf"),
+        ("return", "-1.5e+03"),
+        ("kappa_1", ""),
+    ):
+        changed = lines
+        for line in range(2, 6):
+            changed = with_value(changed, line, column, text)
+        assert read(changed)[column].nunique(dropna=False) == 1
+
+
+@pytest.mark.parametrize(("column", "text"), [(name, x) for name in VALUES for x in VALUES[name]])
+def test_a_value_that_results_cannot_have_is_named_with_its_file_and_line(column, text, table):
+    lines, read = table
+    with pytest.raises(ValueError) as error:
+        read(with_value(lines, 4, column, text))
+    assert "kappas.csv: line 4: " in str(error.value) and "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("column", OWN_COLUMNS)
+def test_a_missing_column_is_named(column, table):
+    lines, read = table
+    with pytest.raises(ValueError, match=f"kappas.csv: line 1: has no column {column} "):
+        read(without_column(lines, column))
+
+
+@pytest.mark.parametrize("wrong", FILES)
+def test_a_file_that_is_no_whole_table_is_named_with_its_line(wrong, table):
+    lines, read = table
+    change, line, words = FILES[wrong]
+    with pytest.raises(ValueError, match=words) as error:
+        read(change(lines))
+    assert f"kappas.csv: {'' if line is None else f'line {line}: '}" in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_the_log_of_a_training_has_numbers_in_every_column(table):
+    _, read = table
+    log = "seed,update,policy_loss\n0,250,1.5\n0,500,{}\n"
+    assert read(log.format("-2e-05").encode(), "x-training")["policy_loss"].tolist() == [1.5, -2e-05]
+    for text in ("", "nan", "low"):
+        with pytest.raises(ValueError, match="x-training.csv: line 3: policy_loss is"):
+            read(log.format(text).encode(), "x-training")
+
+
+@pytest.mark.parametrize("path", sorted(RESULTS.glob("*.csv")), ids=lambda path: path.stem)
+def test_the_shipped_results_are_read(path):
+    if path.stem != "reconstruction":  # of another kind
+        pd.testing.assert_frame_equal(load_results(path.stem), pd.read_csv(path))

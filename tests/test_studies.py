@@ -3,6 +3,8 @@
 import dataclasses
 import os
 import signal
+import subprocess
+import sys
 import threading
 import time
 
@@ -11,6 +13,7 @@ import pandas as pd
 import pytest
 import torch
 from scipy import stats
+from test_locks import HOLD, ROOT
 
 from tutorial_lib import checkpoints, training
 from tutorial_lib.agents import ALGORITHMS, C2IQL, get_algorithm
@@ -42,9 +45,10 @@ COLUMNS = ["task", "algorithm", "profile", "seed", "threshold", "episode", "retu
 def make_file(path, seed=0, task="BallRun", columns=7, costs=(45, 45, 45)):
     """Three random episodes of 100 steps, which cost so much."""
     rng = np.random.default_rng(seed)
+    states = rng.normal(size=(3, 101, columns)).astype(np.float32)
     dataset = Dataset(
-        observations=rng.normal(size=(300, columns)).astype(np.float32),
-        next_observations=rng.normal(size=(300, columns)).astype(np.float32),
+        observations=states[:, :-1].reshape(300, columns),
+        next_observations=states[:, 1:].reshape(300, columns),
         actions=rng.uniform(-1, 1, size=(300, 2)).astype(np.float32),
         rewards=rng.normal(5, 5, size=300).astype(np.float32),
         costs=np.concatenate([np.arange(100) < cost for cost in costs]).astype(np.float32),
@@ -285,6 +289,20 @@ def test_an_agent_that_stopped_early_is_not_taken_for_a_finished_one(data, tmp_p
     assert find_trained(entry, tmp_path / "runs" / "b") is None
 
 
+def test_an_entry_that_another_process_trains_is_left_to_it(data, tmp_path):
+    (entry,) = make_entries(Grid(("BallRun",)), data)
+    folder = tmp_path / "runs" / "study"
+    command, env = [sys.executable, "-c", HOLD, folder / entry.name], os.environ | {"PYTHONPATH": str(ROOT)}
+    with subprocess.Popen(
+        command, env=env, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as other:
+        assert other.stdout.readline() == "held\n"
+        with pytest.raises(BlockingIOError, match=f"{entry.name}: is in use by process {other.pid} on"):
+            train_and_play(entry, folder)
+        other.stdin.close()
+    assert list((folder / entry.name).iterdir()) == []
+
+
 def test_another_dataset_under_the_same_name_is_refused(data, tmp_path):
     (entry,) = make_entries(Grid(("BallRun",), seeds=1), data)
     make_file(data, seed=5)
@@ -429,7 +447,9 @@ def test_results_of_entries_that_are_not_here_are_kept_in_the_grids_order(data, 
             {"task": entry.task, "algorithm": entry.algorithm, "threshold": x, "cost": cost}
             for x, cost in zip((30, 50, 70), costs, strict=True)
         ]
-        pd.DataFrame(rows).to_csv(results_path(entry, folder), index=False)
+        rest = {"profile": "small", "seed": 0, "episode": 0, "return": 1.5, "length": 9, "updates": 3}
+        rows = pd.DataFrame(rows).assign(**rest, predicted_cost=np.nan)
+        rows.to_csv(results_path(entry, folder), index=False)
 
     for number, entry in enumerate(chosen):
         finish(entry, [number, 10 + number, 20 + number])

@@ -104,6 +104,28 @@ def test_a_finished_run_is_not_trained_again(dataset, tmp_path):
     assert train(again, dataset, run_dir=tmp_path, **EVERY)[-1]["update"] == again.updates == 60
 
 
+@pytest.mark.parametrize("name", ["CPQ", "BCQ-Lag"])
+def test_a_finished_run_with_constant_learning_rates_can_be_trained_on_exactly(name, dataset, tmp_path):
+    for updates in (20, 40):
+        agent = make_agent(name, updates=updates)
+        log = train(agent, dataset, run_dir=tmp_path / "longer", **EVERY)
+    expected = train(make_agent(name, updates=40), dataset, run_dir=tmp_path / "whole", **EVERY)
+    assert [row["critic_loss"] for row in log] == [row["critic_loss"] for row in expected]
+    files = [tmp_path / folder / "checkpoint.safetensors" for folder in ("longer", "whole")]
+    assert files[0].read_bytes() == files[1].read_bytes()
+    with pytest.raises(TrainingError, match="has made 40 updates already, more than 30"):
+        train(make_agent(name, updates=30), dataset, run_dir=tmp_path / "longer", **EVERY)
+
+
+def test_a_finished_run_whose_learning_rate_decayed_is_not_trained_on(dataset, tmp_path):
+    """In the first updates of the longer run the rate would have been another one."""
+    train(make_agent("IQL", updates=20), dataset, run_dir=tmp_path, **EVERY)
+    with pytest.raises(
+        TrainingError, match="learning rate of IQL decays to zero over its 20 updates, and is"
+    ):
+        train(make_agent("IQL", updates=40), dataset, run_dir=tmp_path, **EVERY)
+
+
 # --- The log ---
 
 
@@ -206,11 +228,9 @@ def test_nan_in_the_data_stops_the_run_that_meets_it_first(dataset, tmp_path):
         train(make_agent(seeds=(3, 5)), poisoned, run_dir=tmp_path, **every)
     assert re.match("critic_loss is nan at update 8 of seed 5:", str(error.value))
     assert "\n" not in str(error.value)
-    agent = load_agent(tmp_path / "checkpoint.safetensors")
-    trained = {
-        key: value for key, value in agent.state().items() if key != "variable.reward_scale"
-    }  # of all data
-    assert agent.updates == 7 and all(value.isfinite().all() for value in trained.values())
+    saved = tensors_in(tmp_path / "checkpoint.safetensors")
+    trained = {key: value for key, value in saved.items() if key != "variable.reward_scale"}  # of all data
+    assert saved["updates"] == 7 and all(value.isfinite().all() for value in trained.values())
     assert metrics_in(tmp_path)[-1]["update"] == "7"
 
 

@@ -5,8 +5,10 @@ palette of Okabe and Ito, which colour-blind readers can distinguish.
 """
 
 import base64
+import contextlib
 import functools
 import io
+from collections.abc import Iterator
 from typing import Any
 
 import matplotlib
@@ -31,6 +33,18 @@ STYLE: Any = {
 }
 
 
+@contextlib.contextmanager
+def _course_style() -> Iterator[None]:
+    """Uses matplotlib's defaults and `STYLE` in the block, instead of the caller's style.
+
+    The backend stays as it is.
+    """
+    with matplotlib.rc_context():
+        matplotlib.rcdefaults()
+        matplotlib.rcParams.update(STYLE)
+        yield
+
+
 class Picture(Figure):
     """This is a figure that a notebook stores as a PNG image of 256 colours.
 
@@ -40,7 +54,8 @@ class Picture(Figure):
     def small_png(self) -> bytes:
         """Returns the figure as a PNG image of 256 colours."""
         file, small = io.BytesIO(), io.BytesIO()
-        self.savefig(file, format="png", bbox_inches="tight")
+        with _course_style():
+            self.savefig(file, format="png", bbox_inches="tight")
         image = Image.open(file).convert("RGB").quantize(256, dither=Image.Dither.NONE)
         image.save(small, "PNG", optimize=True)
         return small.getvalue()
@@ -67,7 +82,7 @@ def one_figure(draw):
 
     @functools.wraps(draw)
     def in_style(*args, **options):
-        with matplotlib.rc_context(STYLE):
+        with _course_style():
             figure = draw(*args, **options)
             figure.draw_without_rendering()
         plt.close(figure)

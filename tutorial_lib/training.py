@@ -3,6 +3,7 @@
 It uses only the interface that all algorithms share.
 """
 
+import contextlib
 import math
 import time
 from collections.abc import Callable
@@ -15,6 +16,7 @@ from tqdm.auto import tqdm
 from tutorial_lib.agents import Agent
 from tutorial_lib.checkpoints import CHECKPOINT, TrainingError, resume, save_checkpoint
 from tutorial_lib.data.dataset import Batch, Dataset
+from tutorial_lib.files import held
 from tutorial_lib.matmul import products, warn_where_bfloat16_is_slow
 
 
@@ -34,10 +36,28 @@ def train(
     If `run_dir` is given, every `checkpoint_every` updates the log is written to metrics.csv there, and
     everything that is needed to continue to checkpoint.safetensors; then `on_checkpoint` is called. A later
     call with the same folder continues from the checkpoint, and on the same machine its numbers are equal to
-    the bit. Each run has its own generator, seeded with the run's seed, so its batches do not depend on the
-    runs that train beside it. Raises TrainingError if a logged number is NaN or infinite, or if the folder
-    holds another run.
+    the bit. With a larger option `updates` a finished run continues, too, if no learning rate decays over the
+    run: a cosine over more updates has other values from the first update on.
+
+    Each run has its own generator, seeded with the run's seed, so its batches do not depend on the runs that
+    train beside it. The folder is locked while it trains. Raises TrainingError if a logged number is NaN or
+    infinite, or if the folder holds another run, and BlockingIOError if another process trains in it.
     """
+    with held(run_dir) if run_dir else contextlib.nullcontext():
+        return _train(agent, dataset, updates, run_dir, log_every, checkpoint_every, on_checkpoint, progress)
+
+
+def _train(
+    agent: Agent,
+    dataset: Dataset,
+    updates: int | None,
+    run_dir: Path | None,
+    log_every: int,
+    checkpoint_every: int,
+    on_checkpoint: Callable[[Agent], object] | None,
+    progress: bool,
+) -> list[dict]:
+    """Trains as `train` does, in a folder that is locked."""
     updates = agent.config.updates if updates is None else updates
     generators = [torch.Generator().manual_seed(seed) for seed in agent.seeds]
     agent.data_checksum = dataset.checksum

@@ -10,6 +10,7 @@ from tutorial_lib.agents.bc import BCAll, BCBudget, BCFrontier, BCSafe
 from tutorial_lib.agents.bcq import BCQLag
 from tutorial_lib.agents.bear import BEARLag
 from tutorial_lib.agents.c2iql import C2IQL, C2IQLWithoutCC, C2IQLWithoutCR
+from tutorial_lib.agents.caps import CAPS
 from tutorial_lib.agents.cdt import CDT
 from tutorial_lib.agents.ciql import CIQL
 from tutorial_lib.agents.coptidice import COptiDICE
@@ -36,6 +37,7 @@ ALGORITHMS: dict[str, type[Agent]] = {
         CDT,
         BCQLag,
         BEARLag,
+        CAPS,
     )
 }
 """The class of every algorithm, by its name."""

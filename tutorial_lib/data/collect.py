@@ -29,6 +29,7 @@ from tutorial_lib.data.dataset import KEYS, Dataset
 from tutorial_lib.data.hdf5 import read_dataset, write_dataset
 from tutorial_lib.data.ppo import episode_files, run_ppo
 from tutorial_lib.data.thinning import thin
+from tutorial_lib.files import check_output
 from tutorial_lib.tasks import Task
 from tutorial_lib.tasks.bullet import pybullet_package
 from tutorial_lib.tasks.recipes import Recipe
@@ -68,6 +69,7 @@ def collect(
     Raises ValueError where `sources` is empty, repeats a source or has one of another form than `read_source`
     takes, where a run was begun with another recipe, and where `thin` raises it.
     """
+    check_output(out)
     if not sources or len(set(sources)) < len(sources):
         raise ValueError(f"sources {list(sources)}: give at least one, and each of them once")
     kinds_and_seeds = [read_source(source) for source in sources]

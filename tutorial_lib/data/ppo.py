@@ -28,7 +28,7 @@ from tqdm.auto import tqdm
 from tutorial_lib.data.behaviour import KINDS
 from tutorial_lib.data.dataset import KEYS
 from tutorial_lib.data.schedule import Schedule
-from tutorial_lib.files import written_whole
+from tutorial_lib.files import held, sort_metadata, written_whole
 from tutorial_lib.tasks import Task
 from tutorial_lib.tasks.recipes import Recipe
 
@@ -46,12 +46,18 @@ def run_ppo(
     Every finished slice of `slice_steps` is on disk (`episode_files`). A run that was killed continues after
     the last finished one; where all are there, nothing is done. Slice k draws from the seed `seed + 1000 k`,
     so the seeds of one kind should differ by less than 1000. Raises ValueError for a kind that is not in
-    `KINDS`, and for a folder whose run was begun with another recipe or another `slice_steps`.
+    `KINDS`, and for a folder whose run was begun with another recipe or another `slice_steps`. Raises OSError
+    where another process writes into the folder.
     """
     if kind not in KINDS:
         raise ValueError(f"unknown kind of source {kind!r}: the kinds are {', '.join(KINDS)}")
     torch.set_num_threads(1)
-    folder.mkdir(parents=True, exist_ok=True)
+    with held(folder):
+        _run_slices(task, recipe, kind, seed, folder, slice_steps)
+
+
+def _run_slices(task: Task, recipe: Recipe, kind: str, seed: int, folder: Path, slice_steps: int) -> None:
+    """Make the slices of a run that are missing in its folder."""
     made_with = {"recipe": _text_of(recipe), "slice_steps": str(slice_steps)}
     done = len(episode_files(folder))
     if done:
@@ -183,3 +189,5 @@ def save_arrays(arrays: dict[str, np.ndarray], path: Path, metadata: dict[str, s
     """Write arrays to a safetensors file. It appears whole or not at all. Raises OSError where it cannot."""
     with written_whole(path) as temporary:
         save_file({k: np.asarray(value, order="C") for k, value in arrays.items()}, temporary, metadata)
+        if metadata:
+            sort_metadata(temporary)

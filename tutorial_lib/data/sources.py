@@ -9,11 +9,12 @@ from pathlib import Path
 
 from tutorial_lib.data.dataset import Dataset, DatasetError
 from tutorial_lib.data.hdf5 import read_dataset
+from tutorial_lib.data.places import data_folder, in_clone, why_missing
 from tutorial_lib.files import written_whole
 from tutorial_lib.tasks import TASKS, Task, as_task
 
 DSRL_URL = "https://huggingface.co/datasets/YYY-45/DSRL/resolve/main/"
-SHIPPED_DATA = Path(__file__).resolve().parents[2] / "data"
+SHIPPED_DATA = data_folder()
 """The folder of the datasets, agents and results that are shipped with the project."""
 CHECKSUMS = "checksums.txt"
 """The file in `SHIPPED_DATA` with the SHA-256 of every dataset, in the format of `sha256sum`."""
@@ -79,6 +80,8 @@ def find_dataset(task: Task | str, source: Path | str = "shipped") -> Path:
     fetch = f"`c2iql fetch {task.name}` downloads DSRL's"
     if source == "shipped":
         path = SHIPPED_DATA / f"{task.name}.hdf5"
+        if not path.is_file() and not in_clone():
+            raise DatasetError(why_missing(path))
         remedy = f"not shipped with the project: `c2iql collect {task.name}` makes a dataset, {fetch}"
     elif source == "dsrl":
         path = dsrl_directory() / task.dsrl_file

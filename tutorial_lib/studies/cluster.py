@@ -1,7 +1,9 @@
 """Runs the entries of a study on many processes with dask.distributed, on this machine or on a cluster.
 
 When a worker dies, the scheduler gives its entry to another worker, which continues from the entry's last
-checkpoint. Only the updates since then are lost.
+checkpoint. Only the updates since then are lost. If the worker was killed and the other one is on another
+machine, the entry fails instead, because its folder is still locked (see `files.held`). The reason says what
+to delete before the study is run again.
 """
 
 import contextlib

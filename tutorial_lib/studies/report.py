@@ -14,12 +14,13 @@ import pandas as pd
 from tutorial_lib.agents import ALGORITHMS
 from tutorial_lib.agents.c2iql import C2IQLConfig
 from tutorial_lib.costs.conditioning import threshold_set
+from tutorial_lib.data.places import ROOT
 from tutorial_lib.data.recordings import best_left
 from tutorial_lib.data.sources import SHIPPED_DATA, load_dataset, shipped_tasks
-from tutorial_lib.files import written_whole
+from tutorial_lib.files import check_output, written_whole
 from tutorial_lib.scores import with_scores
 from tutorial_lib.studies.figures import cost_return_plane, expected_costs, study_figure
-from tutorial_lib.studies.grids import STUDIES, get_study
+from tutorial_lib.studies.grids import STUDIES, get_study, varied_options
 from tutorial_lib.studies.paper import CLAIMS, TABLE1
 from tutorial_lib.studies.results import (
     RESULTS,
@@ -32,8 +33,6 @@ from tutorial_lib.studies.results import (
 )
 from tutorial_lib.style import Picture
 from tutorial_lib.tasks import DSRL_FRONTIER, TASKS, get_task
-
-ROOT = SHIPPED_DATA.parent
 
 
 def datasheet() -> str:
@@ -96,7 +95,7 @@ def baselines_table() -> str:
     """
     results = load_results("table1")
     if not len(results):
-        return f"*{not_run('table1').capitalize()}.*"
+        return f"*{not_run('table1')}.*"
     found = over_seeds(results).set_index(["algorithm", "task"])
     run = found.index.get_level_values(0).unique()
     ours = [name for name, kind in ALGORITHMS.items() if kind.in_table1]
@@ -167,18 +166,29 @@ def paper_profile_table() -> str:
     return f"{table}\n\n![what the critics expect](results/paper-profile.png)"
 
 
-def write_paper_profile() -> Path | None:
-    """Draws the costs that the critics of profile `paper` predict during training.
+def paper_profile_figure() -> Picture | None:
+    """Returns the figure of the costs that the critics of profile `paper` predict during training.
 
-    Returns the file's path, or None where the profile was not run.
+    Returns None where the profile was not run.
     """
     log = load_results("paper-profile-training")
     if not len(log):
         return None
     task = get_task(load_results("paper-profile")["task"].iloc[0])
     told = threshold_set(task, with_zero=C2IQLConfig.make("paper").zero_threshold)
-    figure = expected_costs(log, load_dataset(task.name).episode_costs.mean(), np.isinf(told).mean())
-    return drawn(figure, RESULTS / "paper-profile.png")
+    return expected_costs(log, load_dataset(task.name).episode_costs.mean(), np.isinf(told).mean())
+
+
+def _results_of(name: str) -> pd.DataFrame:
+    """Returns the results of a study.
+
+    Raises ValueError for an unknown study, and where a column of an option is missing that the study varies.
+    """
+    study, results = get_study(name), load_results(name)
+    missing = [option for option in varied_options(study) if option not in results]
+    if len(results) and missing:
+        raise ValueError(f"{RESULTS / name}.csv: line 1: has no column {', '.join(missing)}")
+    return results
 
 
 def study_section(name: str) -> str:
@@ -187,12 +197,10 @@ def study_section(name: str) -> str:
     The section has the question, the table, the figure and the verdicts on the paper's claims. Where
     the study was not run, the section has its question and says that it was not run.
     """
-    results, lines = load_results(name), [f"### {name}", "", get_study(name).question, ""]
+    results, lines = _results_of(name), [f"### {name}", "", get_study(name).question, ""]
     if not len(results):
-        return "\n".join([*lines, f"*{not_run(name).capitalize()}.*"])
-    lines += [markdown(study_table(results)), ""]
-    if (RESULTS / f"{name}.png").exists():
-        lines += [f"![{name}](results/{name}.png)", ""]
+        return "\n".join([*lines, f"*{not_run(name)}.*"])
+    lines += [markdown(study_table(results)), "", f"![{name}](results/{name}.png)", ""]
     claims = [claim for claim in CLAIMS if claim.study == name]
     if claims:
         lines += [markdown(verdicts(claims, results)), ""]
@@ -209,11 +217,11 @@ def write_study(name: str) -> Path | None:
 
     Returns None where the study was not run.
     """
-    get_study(name)  # raises ValueError for an unknown study
-    results = load_results(name)
+    results, path = _results_of(name), RESULTS / f"{name}.png"
     if not len(results):
         return None
-    return drawn(study_figure(name, results), RESULTS / f"{name}.png")
+    check_output(path)
+    return drawn(study_figure(name, results), path)
 
 
 # --- Pages ---
@@ -237,12 +245,12 @@ def between_marks(page: str, name: str, text: str) -> str:
 def pages() -> dict[Path, str]:
     """Returns the paths of the pages with tables, and the text that each page must have now."""
     data, readme = SHIPPED_DATA / "README.md", ROOT / "README.md"
-    text = data.read_text()
+    text = data.read_text(encoding="utf-8")
     made = {"datasheet": datasheet, "frontier": frontier, "studies": studies_text}
     made["paper-profile"] = paper_profile_table
     for name, table in made.items():
         text = between_marks(text, name, table())
-    front = readme.read_text()
+    front = readme.read_text(encoding="utf-8")
     front_tables = (("results", results_table), ("baselines", baselines_table))
     for name, table in front_tables:
         front = between_marks(front, name, table())
@@ -250,17 +258,29 @@ def pages() -> dict[Path, str]:
 
 
 def write() -> list[Path]:
-    """Writes the pages, the figures of the datasets and the studies' figures, and returns their paths."""
-    figures = [path for path in (*map(write_study, STUDIES), write_paper_profile()) if path]
-    written = pages()
-    for path, text in written.items():
+    """Writes the pages, the figures of the datasets and the studies' figures, and returns their paths.
+
+    Everything is made before anything is written, so that an error leaves all files as they were.
+    """
+    texts = pages()
+    figures = {SHIPPED_DATA / "planes" / f"{name}.png": dataset_figure(name) for name in shipped_tasks()}
+    for name in STUDIES:
+        results = _results_of(name)
+        if len(results):
+            figures[RESULTS / f"{name}.png"] = study_figure(name, results)
+    if paper := paper_profile_figure():
+        figures[RESULTS / "paper-profile.png"] = paper
+    for path in (*texts, *figures):
+        check_output(path)
+    for path, text in texts.items():
         with written_whole(path) as temporary:
-            temporary.write_text(text)
-    pictures = [
-        drawn(cost_return_plane(load_dataset(name), get_task(name)), SHIPPED_DATA / "planes" / f"{name}.png")
-        for name in shipped_tasks()
-    ]
-    return [*written, *pictures, *figures]
+            temporary.write_text(text, encoding="utf-8")
+    return [*texts, *(drawn(figure, path) for path, figure in figures.items())]
+
+
+def dataset_figure(name: str) -> Picture:
+    """Returns the figure of the episodes of a shipped dataset."""
+    return cost_return_plane(load_dataset(name), get_task(name))
 
 
 def drawn(figure: Picture, path: Path) -> Path:

@@ -8,6 +8,10 @@ C / L, which is at most 1 where the limit L is kept. `results` is always a table
 episode, with the columns `OWN_COLUMNS` and those of the options that the study varies.
 """
 
+import csv
+import io
+import math
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -16,9 +20,11 @@ import pandas as pd
 from numpy.typing import ArrayLike
 from scipy import stats
 
+from tutorial_lib.data.places import why_missing
 from tutorial_lib.data.sources import SHIPPED_DATA
 from tutorial_lib.scores import with_scores
 from tutorial_lib.studies.paper import Claim
+from tutorial_lib.tasks import TASKS
 
 RESULTS = SHIPPED_DATA / "results"
 """The folder of the shipped results."""
@@ -27,17 +33,125 @@ OWN_COLUMNS = (
     "task algorithm profile seed threshold episode return cost length predicted_cost updates".split()
 )
 """The columns that the results of every study have. The column `threshold` holds the limit of the episode."""
+MEASURED = ("episode", "return", "cost", "length", "predicted_cost", "reconstruction_error")
+"""The columns in which the rows of one run and limit differ, or may differ."""
+WHOLE = ("seed", "episode", "length", "updates", "update")
+NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII)
+CONFLICT = ("<<<<<<<", "|||||||", "=======", ">>>>>>>")
+"""How Git begins the lines that it writes around two versions of a file."""
 
 
 def load_results(name: str, folder: Path = RESULTS) -> pd.DataFrame:
-    """The raw results of a study. The table has no rows where the study was not run."""
+    """The raw results of a study. The table has no rows where the study was not run.
+
+    Raises ValueError for a file that `read_results` refuses.
+    """
     path = folder / f"{name}.csv"
-    return pd.read_csv(path) if path.exists() else pd.DataFrame(columns=OWN_COLUMNS)
+    return read_results(path) if path.exists() else pd.DataFrame(columns=OWN_COLUMNS)
+
+
+def read_results(path: Path) -> pd.DataFrame:
+    """The raw results in a CSV file, or the log of a training if the file's name ends in `-training.csv`.
+
+    Every line is checked. Raises ValueError in one line, which names the file and the line, for a file that
+    is no CSV, was cut off or has the marks of a conflict; for a missing column, a value of another type and a
+    number that is NaN or infinite (limits may be infinite, and an algorithm may predict no cost); and for an
+    episode that is there twice or is missing.
+    """
+    is_log, data = path.stem.endswith("-training"), path.read_bytes()
+    try:
+        rows = _rows_of(data, ["seed", "update"] if is_log else OWN_COLUMNS)
+        for line, row in rows:
+            for column, text in row.items():
+                if problem := _problem_of(column, text, is_log):
+                    raise ValueError(f"line {line}: {column} is {text!r}, and {problem}")
+        if not is_log:
+            _check_options(rows)
+            _check_episodes(rows)
+    except (ValueError, csv.Error) as error:
+        raise ValueError(f"{path}: {error}") from None
+    return pd.read_csv(io.BytesIO(data))
+
+
+def _rows_of(data: bytes, required: Sequence[str]) -> list[tuple[int, dict[str, str]]]:
+    """The rows of a CSV, each with the number of its line. Raises ValueError for what is no whole CSV."""
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise ValueError(f"line {data.count(10, 0, error.start) + 1}: is not text in UTF-8") from None
+    for line, words in enumerate(text.split("\n"), 1):
+        if "\0" in words:
+            raise ValueError(f"line {line}: has a NUL byte")
+        if words.startswith(CONFLICT):
+            raise ValueError(f"line {line}: is the mark of a conflict: keep one of the two versions")
+    if not text.endswith("\n"):
+        raise ValueError(f"line {line}: has no end, so the file was cut off")
+    reader = csv.reader(io.StringIO(text, newline=""), strict=True)
+    header = next(reader)
+    if missing := [name for name in required if name not in header]:
+        raise ValueError(f"line 1: has no column {', '.join(missing)} (commas separate columns)")
+    if len(set(header)) < len(header):
+        raise ValueError("line 1: has two columns with one name")
+    rows = []
+    for row in reader:
+        if len(row) != len(header):
+            raise ValueError(f"line {reader.line_num}: has {len(row)} values for {len(header)} columns")
+        rows.append((reader.line_num, dict(zip(header, row, strict=True))))
+    return rows
+
+
+def _problem_of(column: str, text: str, is_log: bool) -> str:
+    """What is wrong with a value, or no words. The columns of options are checked by `_check_options`."""
+    if column == "task":
+        return "" if text in TASKS else "must be the name of a task"
+    if not (is_log or column in OWN_COLUMNS or column == "reconstruction_error"):
+        return ""
+    if column in ("algorithm", "profile"):
+        return "" if text else "must be a name"
+    if column == "predicted_cost" and not text or column in ("threshold", "limit") and text == "inf":
+        return ""
+    if not NUMBER.fullmatch(text) or not math.isfinite(float(text)):
+        return "must be a finite number"
+    if column in WHOLE and not (float(text) >= 0 and float(text).is_integer()):
+        return "must be a whole number, 0 or more"
+    return "must be 0 or more" if column in ("cost", "threshold") and float(text) < 0 else ""
+
+
+def _check_options(rows: list[tuple[int, dict[str, str]]]) -> None:
+    """Raises ValueError where a column of an option has numbers in some lines and words in others."""
+    kinds: dict[str, tuple[bool, int]] = {}
+    for line, row in rows:
+        for column in set(row) - {*OWN_COLUMNS, "reconstruction_error"}:
+            if text := row[column]:  # an algorithm that does not have the option has no value
+                is_number = NUMBER.fullmatch(text) is not None
+                first, where = kinds.setdefault(column, (is_number, line))
+                if is_number != first:
+                    raise ValueError(
+                        f"line {line}: {column} is {text!r}, of another type than in line {where}"
+                    )
+
+
+def _check_episodes(rows: list[tuple[int, dict[str, str]]]) -> None:
+    """Raises ValueError where an episode is there twice, or where a run has fewer episodes than another."""
+    episodes: dict[tuple, dict[int, int]] = {}
+    for line, row in rows:
+        run = tuple(text for column, text in row.items() if column not in MEASURED)
+        lines, episode = episodes.setdefault(run, {}), int(float(row["episode"]))
+        if episode in lines:
+            raise ValueError(f"line {line}: is the same episode as line {lines[episode]}")
+        lines[episode] = line
+    most = max(map(len, episodes.values()), default=0)
+    for lines in episodes.values():
+        if set(lines) != set(range(most)):
+            words = f"has {len(lines)} episodes, and other runs have {most}: lines are missing"
+            raise ValueError(f"line {max(lines.values())}: the last one of its run, which {words}")
 
 
 def not_run(name: str) -> str:
     """The words that are shown instead of a study's numbers where it was not run."""
-    return f"not run: `c2iql study {name}` makes it"
+    if not RESULTS.is_dir():
+        return why_missing(RESULTS)
+    return f"Not run: `c2iql study {name}` makes it"
 
 
 def options_of(results: pd.DataFrame) -> list[str]:

@@ -12,20 +12,20 @@ import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
 import torch
-from safetensors import SafetensorError, safe_open
 
 from tutorial_lib import checkpoints, training
 from tutorial_lib.agents import Agent, get_algorithm, slug
 from tutorial_lib.config import Config
 from tutorial_lib.data.dataset import Dataset
 from tutorial_lib.data.sources import SHIPPED_DATA, load_dataset
+from tutorial_lib.files import held, sweep
 from tutorial_lib.playing import evaluate
 from tutorial_lib.scores import save_results
+from tutorial_lib.studies.results import read_results
 from tutorial_lib.tasks import get_task
 
 
@@ -85,7 +85,7 @@ def train_and_play(runs: Runs, folder: Path, tell: Callable[[int], object] = lam
 
     A finished entry is left as it is, an interrupted training is continued, and an equal trained agent that
     exists is used. `tell` is called at every checkpoint with the number of updates so far. Raises ValueError
-    where the dataset is not the study's.
+    where the dataset is not the study's, and BlockingIOError where another process trains the entry.
     """
     path = results_path(runs, folder)
     if path.exists():
@@ -98,15 +98,16 @@ def train_and_play(runs: Runs, folder: Path, tell: Callable[[int], object] = lam
     if agent is None:
         agent = runs.build()
         run_dir = folder / runs.name
-        training.train(
-            agent,
-            dataset,
-            run_dir=run_dir,
-            checkpoint_every=1_000,
-            on_checkpoint=lambda agent: tell(agent.updates),
-            progress=False,
-        )
-        checkpoints.save_agent(agent, run_dir / "agent.safetensors")
+        with held(run_dir):
+            training.train(
+                agent,
+                dataset,
+                run_dir=run_dir,
+                checkpoint_every=1_000,
+                on_checkpoint=lambda agent: tell(agent.updates),
+                progress=False,
+            )
+            checkpoints.save_agent(agent, run_dir / "agent.safetensors")
     save_results(play(runs, agent, dataset), path)
     return path
 
@@ -152,43 +153,30 @@ def _has_equal_runs(path: Path, runs: Runs) -> bool:
     """Does this file hold an agent with the same task, algorithm, data and options, and all of these runs?"""
     kind = get_algorithm(runs.algorithm)
     try:
-        with safe_open(path, "pt") as file:
-            header = {key: _read(value) for key, value in (file.metadata() or {}).items()}
-        if [header[key] for key in ("task", "algorithm", "data")] != [
-            runs.task,
-            runs.algorithm,
-            runs.checksum,
-        ]:
-            return False
-        config = kind.Config(**header["config"])
-        pairs = list(zip(header["seeds"], header["limits"] or [None] * len(header["seeds"]), strict=True))
-    except (OSError, SafetensorError, KeyError, TypeError, ValueError):
+        header = checkpoints.load_header(path)
+    except checkpoints.TrainingError:
         return False  # written by another version, or not yet complete
+    if (header.task.name, header.kind, header.data) != (runs.task, kind, runs.checksum):
+        return False
+    pairs = set(zip(header.seeds, header.limits or [None] * len(header.seeds), strict=True))
     same = {name: getattr(runs.config, name) for name in kind.at_test}
-    return config.changed(**same) == runs.config and set(runs.pairs) <= set(pairs)
-
-
-def _read(value: str) -> Any:
-    """The value of one field of an agent's file: JSON, or the text itself."""
-    try:
-        return json.loads(value)
-    except json.JSONDecodeError:  # names are not written as JSON
-        return value
+    return header.config.changed(**same) == runs.config and set(runs.pairs) <= pairs
 
 
 def collect(chosen: Sequence[Runs], folder: Path, path: Path, keep: bool = False) -> int:
     """Write the results of the finished entries in `folder` into one CSV, `path`.
 
     Returns the number of finished entries. With `keep`, the CSV's rows of other entries stay: a clone of the
-    project has the results but not the runs. Raises ValueError where these rows are of a study with other
-    options.
+    project has the results but not the runs. Nothing is written before all files are checked. Raises
+    ValueError for a file that `read_results` refuses, and where these rows are of a study with other options.
     """
+    sweep(folder)
     done = [results_path(runs, folder) for runs in chosen if results_path(runs, folder).exists()]
     if not done:
         return 0
-    results = pd.concat([pd.read_csv(file) for file in done], ignore_index=True)
+    results = pd.concat([read_results(file) for file in done], ignore_index=True)
     if keep and path.exists():
-        before = pd.read_csv(path)
+        before = read_results(path)
         key = ["task", "algorithm", "threshold", *chosen[0].columns]
         if missing := set(key) - set(before.columns):
             raise ValueError(
