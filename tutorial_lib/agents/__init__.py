@@ -17,6 +17,8 @@ from tutorial_lib.agents.coptidice import COptiDICE
 from tutorial_lib.agents.cpq import CPQ, PushedCPQ
 from tutorial_lib.agents.fisor import FISOR
 from tutorial_lib.agents.iql import IQL
+from tutorial_lib.agents.voce import VOCE
+from tutorial_lib.agents.wsac import WSAC
 
 ALGORITHMS: dict[str, type[Agent]] = {
     agent.name: agent
@@ -38,6 +40,8 @@ ALGORITHMS: dict[str, type[Agent]] = {
         BCQLag,
         BEARLag,
         CAPS,
+        WSAC,
+        VOCE,
     )
 }
 """The class of every algorithm, by its name."""

@@ -12,24 +12,33 @@ While it plays, CAPS is told a limit. At every step, what is left of the limit i
 as if it were spent evenly over the remaining steps. Of the heads whose action has a Q_c of at most this, the
 one whose action has the highest Q_r acts. If there is none, the one with the least Q_c acts.
 
-Q_c is not the cost of the policy that acts. It is the cost of the action if the cheapest recorded actions
-follow it. So an action that looks affordable leads to a state from which CAPS can still become cheap, and the
-switching keeps the limit. Q_c does not know the time, and the discounted budget of the same cost rate falls
-towards the end of an episode. So the last steps are mostly played by the cheapest head.
+Q_c is not the cost of the policy that acts. It is the cost of the action if cheap recorded actions follow it.
+CAPS may take a dear action as long as it can become cheap afterwards. Q_c does not know the time, but the
+discounted budget of the same cost per step falls towards the end of an episode. So the cheapest action is
+played more often there, and a part of the limit can be left.
 
 Departures:
 
 1. A head between the two ends has the weight (1 - m) w_r + m w_c, with m = i / (heads - 1) for head i. In
-   CAPS's code it is w_r + 2 m w_c. For up to three heads both have the same minimum.
-2. The heads' standard deviations are trained, as in IQL. In CAPS's code they are in a list that its optimiser
-   does not see, so they stay at one, and the heads minimise a weighted squared error.
+   CAPS's code it is w_r + 2 m w_c, which for three heads is twice as much.
+2. The heads' standard deviations are trained, as in IQL. In CAPS's code they are in a list that the optimiser
+   does not see. They stay at one, and so the heads minimise a weighted squared error.
 3. The policy's learning rate decays to zero over the run. In CAPS's code the cosine is ten times as long as
    the run.
 4. Costs are not negated here. The expectile of V_c is 1 - kappa_1, and of two critics the one with the higher
    cost counts. This is the same as an expectile of kappa_1 and the lower value for negative rewards.
 5. The rewards stay as they are, and the advantage in reward is multiplied by 0.1. In CAPS's code all rewards
    are. The weights are the same.
-6. The hidden layers have the width of the profile. CAPS's code has 512.
+6. Q_c may be equal to the budget. In CAPS's code it must be less.
+7. The width of the networks and the number of updates are those of the profile. CAPS's code has 512 and
+   100,000.
+
+Measured: on BallCircle (profile `small`, one trial with seed 0 only, 10 episodes) CAPS had a normalised
+reward and cost of 0.77 / 0.82, 0.86 / 0.90 and 0.87 / 0.66 under limits of 30, 50 and 70. Played alone in
+four episodes, the reward head cost 60 and the cost head 54. So neither keeps a limit of 30 or 50, and the
+switching does. Under a limit of 50 the reward head acted in 79% of all steps and in 20% of the last ten. With
+no limit it acted in 82%, because in the other states the action of the cost head has the higher Q_r. On
+CarCircle (3,300 of the 12,000 updates) it had 0.70 / 0.74, 0.73 / 0.84 and 0.74 / 0.90.
 """
 
 from collections.abc import Sequence
