@@ -86,7 +86,7 @@ def results_table(kind: type[Agent], results: pd.DataFrame) -> str:
     """The algorithm's results for Table 1, one row per task, or a sentence where there are none."""
     part = with_scores(results[results["algorithm"] == kind.name])
     if part.empty:
-        return "It is no row of Table 1." if not kind.in_table1 else f"*{not_run('table1').capitalize()}.*"
+        return "It is no row of Table 1." if not kind.in_table1 else f"*{not_run('table1')}.*"
     means = part.groupby("task", sort=False)[["reward_score", "cost_score"]].mean()
     seeds = part.groupby("task")["seed"].nunique()
     rows = [f"| {task} | {seeds[task]} | {r:.2f} | {c:.2f} |" for task, (r, c) in means.iterrows()]

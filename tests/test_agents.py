@@ -99,11 +99,13 @@ class Slow:
         output = functional_call(self.agent.modules[network], weights, tuple(inputs))
         return [x.squeeze(0).tolist() for x in output] if network == "policy" else output.tolist()
 
-    def inputs(self, observation, limit):
+    def inputs(self, observation, limit, t=0.0):
         mean, std = self.variable("observation_mean"), self.variable("observation_std")
         x = [(o - m) / s for o, m, s in zip(observation, mean, std, strict=True)]
         if self.name in CONDITIONED:
             x.append(1.5 if math.isinf(limit) else limit / TASK.cost_range)
+            if self.agent.config.clock:
+                x.append(t / T)
         return x
 
     def cost(self, heads):
@@ -133,7 +135,10 @@ class Slow:
         config = self.agent.config
         if config.unsafe_price is None:
             return q if cost <= limit else 0.0
-        price = config.unsafe_price * self.variable("reward_scale") / TASK.cost_range
+        unit = self.variable("reward_scale") / TASK.cost_range
+        if config.price_unit == "advantage":
+            unit = self.variable("exchange_rate")
+        price = config.unsafe_price * unit
         state_cost = self.cost(self.call("online", "cost_value", s)[0])
         return q - price * (max(cost - limit, 0) - max(state_cost - limit, 0))
 
@@ -146,18 +151,24 @@ class Slow:
 
     def losses(self, batch):
         config, sums = self.agent.config, {}
+        self.untouched = []  # both advantages of each action that the limit does not touch
 
         def add(name, value):
             sums[name] = sums.get(name, 0.0) + value / B
 
         for row, limit in enumerate(batch["limit"].tolist()):
             x = Batch(**{field: batch[field][row].tolist() for field in Batch._fields})
-            s, s_next = self.inputs(x.observations, limit), self.inputs(x.next_observations, limit)
+            left = max(limit - x.costs, 0.0) if getattr(config, "clock", False) else limit
+            s = self.inputs(x.observations, limit, x.timesteps)
+            s_next = self.inputs(x.next_observations, left, x.timesteps + 1)
             a = x.actions
             q = min(k[0] for k in self.call("target", "critics", s, a))
             v = self.call("online", "value", s)[0]
             if self.name != "IQL":
                 backup, q_cost, cost = self.cost_of(x, s, a, s_next)
+                state_cost = self.cost(self.call("online", "cost_value", s)[0])
+                if cost <= limit and state_cost <= limit:
+                    self.untouched.append((q - self.call("online", "value", s)[0], cost - state_cost))
                 q = self.penalised(q, cost, s, limit)
                 add("safe_fraction", cost <= limit)
             u = q - v
@@ -182,6 +193,9 @@ class Slow:
             else:
                 w = min(100.0, math.exp(config.awr_alpha * u * 1000 / (TASK.max_return - TASK.min_return)))
             add("policy_loss", -w * self.log_prob(s, a))
+        if getattr(config, "price_unit", "") == "advantage" and config.unsafe_price is not None:
+            spreads = np.std(self.untouched, axis=0) if self.untouched else (0.0, 0.0)
+            sums |= dict(zip(("reward_spread", "cost_spread"), spreads, strict=True))
         return sums
 
 
@@ -194,6 +208,9 @@ VARIANTS = [
     {"unsafe_price": 0.5},
     {"recorded_step": True},
     {"recorded_step": True, "unsafe_price": 0.5, "time_limits": "mask"},
+    {"unsafe_price": 0.5, "price_unit": "advantage"},
+    {"clock": True, "time_limits": "mask"},
+    {"clock": True, "time_limits": "mask", "unsafe_price": 0.5, "price_unit": "advantage"},
     {"cost_critics": 1},
     {"cost_critics": 3},
     {"kappa_1": 0.5, "kappa_2": 0.6, "gamma": 0.7},
@@ -229,7 +246,7 @@ class WithoutBoth(get_algorithm("C2IQL")):
     conditioned = reconstructs = False
 
 
-@pytest.mark.parametrize("options", [v for v in VARIANTS if "awr_alpha" not in v], ids=str)
+@pytest.mark.parametrize("options", [v for v in VARIANTS if not {"awr_alpha", "clock"} & set(v)], ids=str)
 def test_without_its_two_parts_c2iql_is_ciql(options):
     """So an ablation compares what it says, and nothing else; from the first guess of the costs on."""
     agents = [make_agent(kind, **options) for kind in (WithoutBoth, get_algorithm("CIQL"))]
@@ -309,7 +326,7 @@ def test_an_infinite_limit_penalises_nothing(name):
         slow = Slow(agent)
         told = slow.inputs
         slow.name, slow.agent = "IQL", SimpleNamespace(modules=agent.modules, config=make_agent("IQL").config)
-        slow.inputs = lambda observation, limit: [*told(observation, limit), 1.5]  # infinity's code
+        slow.inputs = lambda observation, limit, t=0.0: [*told(observation, limit), 1.5]  # infinity's code
         return one_update(agent, batch), slow.losses(of_run(batch, 0))
 
     first, reward_only = update(1)
@@ -344,6 +361,64 @@ def test_thresholds_are_drawn_for_each_sample_or_for_each_batch(name):
 
     with_zero = limits_drawn(make_agent(name, zero_threshold=True, batch_size=4_000), generator)
     assert (with_zero == 0).float().mean().item() == pytest.approx(0.2, abs=0.03)
+
+
+@pytest.mark.parametrize("name", CONDITIONED)
+def test_thresholds_can_come_from_a_range_or_from_the_episodes(name):
+    generator = torch.Generator().manual_seed(0)
+    draws = limits_drawn(
+        make_agent(name, thresholds="range", infinite_share=0.2, batch_size=4_000), generator
+    )
+    finite = draws[draws.isfinite()]
+    assert 1 - len(finite) / 4_000 == pytest.approx(0.2, abs=0.03)
+    shares = torch.histc(finite, 4, 0, TASK.cost_range) / len(finite)
+    assert shares.tolist() == pytest.approx([0.25] * 4, abs=0.03)
+
+    for clock in (False, True):
+        more = {"clock": True, "time_limits": "mask"} if clock else {}
+        agent = make_agent(name, thresholds="episode", infinite_share=0.3, batch_size=4_000, **more)
+        data = random_data(0)._replace(timesteps=torch.arange(200.0) % T)
+        drawn = agent.draw(data, generator, math.inf)
+        assert drawn["limit"].isinf().float().mean().item() == pytest.approx(0.3, abs=0.03)
+        rows = zip(*(drawn[key].tolist() for key in ("limit", "costs_to_go", "timesteps")), strict=True)
+        for limit, cost, t in rows:
+            assert math.isinf(limit) or limit == pytest.approx(cost if clock else cost * T / (T - t))
+
+
+def test_the_exchange_rate_follows_the_ratio_of_the_spreads():
+    agent = make_agent("C2IQL", unsafe_price=3.0, price_unit="advantage")
+    agent.prepare([toy_dataset()], progress=False)
+    scale = agent.variables["reward_scale"].item()
+    assert agent.variables["exchange_rate"].item() == pytest.approx(scale / TASK.cost_range)
+    randomise(agent)
+    before = agent.variables["exchange_rate"].item()
+    scalars = one_update(agent, batch_for(agent))
+    (reward,), (cost,) = scalars["reward_spread"], scalars["cost_spread"]
+    assert reward > 0 and cost > 0
+    expected = before + 0.01 * (reward / cost - before)
+    assert agent.variables["exchange_rate"].item() == pytest.approx(expected, rel=1e-5)
+    unsafe = random_batch(agent, limit=torch.full((1, B), -1e6))  # every action is priced: nothing to measure
+    scalars, before = one_update(agent, unsafe), agent.variables["exchange_rate"].item()
+    assert scalars["cost_spread"] == [0.0] and agent.variables["exchange_rate"].item() == before
+
+
+def test_a_clock_needs_limits_on_the_remaining_cost():
+    with pytest.raises(ValueError, match="clock=True needs time_limits='mask'"):
+        make_agent("C2IQL", clock=True)
+
+
+@pytest.mark.parametrize("name", CONDITIONED)
+def test_with_a_clock_the_policy_sees_the_time(name):
+    agent = make_agent(name, clock=True, time_limits="mask")
+    randomise(agent)
+    observations, limits = np.zeros((2, 3), np.float32), np.array([1.0, 6.0])
+    at = [agent.act(observations, limits, 0, t) for t in (0, 5)]
+    assert not np.allclose(*at)
+    player = agent.player(limits, [0, 1])
+    assert player.act(observations) == pytest.approx(at[0])
+    for _ in range(5):
+        player.see(np.zeros(2), np.zeros(2))
+    assert player.act(observations) == pytest.approx(agent.act(observations, player.told, 0, 5))
 
 
 def test_every_run_draws_from_its_own_generator_and_under_its_own_limit():
@@ -514,6 +589,7 @@ class Transitions:
             next_observations=tensor(np.eye(STATES)[self.next]),
             terminals=tensor(self.terminal),
             timeouts=tensor(np.zeros(len(self.pair))),
+            timesteps=tensor(np.zeros(len(self.pair))),
             limit=tensor(np.full(len(self.pair), limit)),
         )
 

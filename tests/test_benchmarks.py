@@ -162,7 +162,9 @@ def test_every_algorithm_is_timed_as_it_trains():
             for _ in range(2):
                 same.update(same.draw_all(watch.data, generators))
         for key, value in same.state().items():
-            torch.testing.assert_close(agent.state()[key], value, rtol=1e-4, atol=1e-5, msg=f"{name}: {key}")
+            # FISOR's policy has no gradient where no action is feasible, and Adam takes rounding for one.
+            close = {"rtol": 1e-4, "atol": 1e-3 if key.startswith("online.policy.blocks") else 1e-5}
+            torch.testing.assert_close(agent.state()[key], value, msg=f"{name}: {key}", **close)
 
 
 def test_on_a_gpu_the_whole_is_timed_without_waiting_within_an_update(monkeypatch):

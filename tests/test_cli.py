@@ -17,7 +17,7 @@ import torch
 from safetensors import safe_open
 
 from tutorial_lib import __main__ as cli
-from tutorial_lib import options, training
+from tutorial_lib import checkpoints, options, training
 from tutorial_lib.agents import ALGORITHMS, C2IQL, CIQL, get_algorithm, slug
 from tutorial_lib.checkpoints import load_agent
 from tutorial_lib.config import PROFILES
@@ -183,7 +183,7 @@ def test_it_runs_as_a_module():
         (["train", "BallRun", "--profile", "huge"], "unknown profile 'huge': the profiles are paper, small"),
         (["train", "BallRun", "--profile=huge"], "unknown profile 'huge': the profiles are paper, small"),
         (["train", "--updates", "5", "AntRun"], "write the task before the options: c2iql train [ALGORITHM]"),
-        (["train", "BallRun", "--seeds", "-2"], "seeds [-2]: at least one, each 0 or more"),
+        (["train", "BallRun", "--seeds", "-2"], "--seeds: each must be from 0 to 2^63 - 1"),
         (["train", "BallRun", "--seeds"], "--seeds: give at least one"),
         (["study", "kappas", "--option", "kappa=0.7"], "--option kappa=0.7: write NAME=VALUE with one of"),
         (["study", "kappas", "--option", "kappa_1"], "--option kappa_1: write NAME=VALUE"),
@@ -297,7 +297,7 @@ def test_training_without_options_makes_the_shipped_agents(path, c2iql, monkeypa
         header = file.metadata()
     kind, args = parsed(header["task"])
     assert path.stem == header["task"] and kind.name == header["algorithm"]
-    assert dataclasses.asdict(args.config) == json.loads(header["config"])
+    assert dataclasses.asdict(args.config) == checkpoints.NEWER_OPTIONS | json.loads(header["config"])
     assert args.config == kind.configure("small", TASKS[args.task])
 
     made = []
@@ -306,7 +306,7 @@ def test_training_without_options_makes_the_shipped_agents(path, c2iql, monkeypa
     assert c2iql("train", path.stem, "--seeds", *json.loads(header["seeds"]))[0] == 0
     where, agent = made
     assert (agent.task.name, agent.name, agent.limits) == (path.stem, header["algorithm"], None)
-    assert dataclasses.asdict(agent.config) == json.loads(header["config"])
+    assert dataclasses.asdict(agent.config) == checkpoints.NEWER_OPTIONS | json.loads(header["config"])
     assert list(agent.seeds) == json.loads(header["seeds"])
     assert where == (agent.task, "shipped")  # with the agent's checksum: test_studies.py
 
@@ -319,7 +319,7 @@ def test_an_algorithm_that_needs_a_limit_gets_a_run_for_each(
     made, kind = [], get_algorithm(name)
     train = ["train", slug(name), "BallRun", "--data", data, "--seeds", 3, 5, "--out", tmp_path]
     if limits and not kind.needs_limit:
-        assert c2iql(*train, "--limits", *limits)[0] == 1
+        assert c2iql(*train, "--limits", *limits)[0] == 2
         return
     monkeypatch.setattr(training, "train", lambda agent, data, **_: made.append(agent) or sys.exit(0))
     assert c2iql(*train, *(["--limits", *limits] if limits else []))[0] == 0
@@ -415,7 +415,7 @@ def test_train_and_evaluate(c2iql, data, tmp_path):
     status, out, err = c2iql(*certify, "--out", table)
     assert status == 0 and "95% intervals" in out, err
     rows = pd.read_csv(table)
-    assert rows["threshold"].tolist() == [20, 40] and (rows["episodes"] == 3).all()
+    assert rows["threshold"].tolist() == [20, 40] * 2 and (rows["episodes"] == 3).all()
     assert ((rows["exceeds_low"] <= rows["exceeds"]) & (rows["exceeds"] <= rows["exceeds_high"])).all()
 
     status, _, err = c2iql(*train, "--kappa-2", 0.7)  # the folder is another run's

@@ -8,6 +8,7 @@ import torch
 
 from tutorial_lib.costs.conditioning import (
     ConditioningConfig,
+    after_step,
     check_limit,
     draw_thresholds,
     encode,
@@ -54,7 +55,7 @@ def test_a_limit_that_is_negative_or_no_number_is_an_error_that_shows_it(limit):
 @pytest.mark.parametrize("zero", [False, True])
 def test_thresholds_are_drawn_from_the_whole_set_in_equal_shares(zero):
     config = ConditioningConfig(batch_size=5_000, zero_threshold=zero)
-    draws = draw_thresholds(CAR_RUN, config, torch.Generator().manual_seed(0))
+    draws = draw_thresholds(CAR_RUN, config, {}, torch.Generator().manual_seed(0))
     expected = [0.0] * zero + [10, 20, 40, math.inf]
     assert draws.dtype == torch.float32 and sorted(set(draws.tolist())) == expected
     shares = [(draws == threshold).float().mean().item() for threshold in expected]
@@ -174,6 +175,20 @@ def test_a_remaining_budget_is_not_rescaled():
     assert told(20, 0, 100, remaining=True) == [20] and told(20, 0, 100) == [40]
     assert told(20, 12, 199, remaining=True) == [math.inf]
     assert told(20, 12, 199, remaining=True, infinite_at_test="never") == [10]
+
+
+def test_where_all_thresholds_were_trained_on_the_budget_itself_is_told():
+    for thresholds in ("range", "episode"):
+        assert told(20, 5, 100, thresholds=thresholds) == [30]
+        assert told(20, 5, 100, thresholds=thresholds, remaining=True) == [15]
+        assert told(20, 25, 100, thresholds=thresholds) == [0]
+        assert told(150, 0, 10, thresholds=thresholds, remaining=True) == [40]  # CarRun's cost range
+        assert told(20, 10, 190, thresholds=thresholds) == [math.inf]  # covered
+
+
+def test_a_threshold_shrinks_by_what_is_paid_and_never_below_zero():
+    left = after_step(torch.tensor([3.0, 1.0, 0.0, math.inf]), torch.tensor([1.0, 1.0, 1.0, 1.0]))
+    assert left.tolist() == [2, 0, 0, math.inf]
 
 
 def test_every_episode_is_told_its_own():

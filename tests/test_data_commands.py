@@ -19,16 +19,16 @@ RETURNS = (100.0, 91.0, 89.0, -20.0, 300.0)
 
 @pytest.fixture
 def c2iql(monkeypatch, capsys):
-    """Type a command; returns what the program ended with (None: well), and what it printed."""
+    """Type a command; returns the exit status (0: well), what it printed, and what it said went wrong."""
 
     def run(*arguments):
         monkeypatch.setattr(sys, "argv", ["c2iql", *map(str, arguments)])
-        status = None
+        status = 0
         try:
             cli.main()
         except SystemExit as error:
             status = error.code
-        return status, capsys.readouterr().out
+        return status, *capsys.readouterr()
 
     return run
 
@@ -56,8 +56,8 @@ def rows_of(out):
 
 def test_check_describes_a_good_file(c2iql, tmp_path, dataset):
     path = write_dataset(tmp_path / "a.hdf5", dataset, "CarRun")
-    status, out = c2iql("data", "check", path, "--task", "CarRun")
-    assert status is None and "ERROR" not in out and "WARNING" not in out
+    status, out, err = c2iql("data", "check", path, "--task", "CarRun")
+    assert status == 0 and "ERROR" not in out and "WARNING" not in out
     assert f"5 episodes, {5 * T} transitions, 0 terminals, 5 time limits" in out
     rows = rows_of(out)
     assert ["length", "200.0", "200.0", "200.0", "200.0"] in rows
@@ -78,8 +78,8 @@ def test_check_lists_every_error_and_warning_and_fails(c2iql, tmp_path, dataset)
         file["costs"][4] = 3
         file["terminals"][T - 1] = True
         file["actions"][7] = 2
-    status, out = c2iql("data", "check", path, "--task", "CarRun")
-    assert status == f"c2iql: {path}: not usable for CarRun: errors: 2"
+    status, out, err = c2iql("data", "check", path, "--task", "CarRun")
+    assert (status, err) == (2, f"c2iql: {path}: not usable for CarRun: errors: 2\n")
     found = [line.split(": ") for line in out.splitlines() if line.startswith(("ERROR", "WARNING"))]
     kinds = [(line[0], line[1]) for line in found]
     error, warning = f"ERROR {path}", f"WARNING {path}"
@@ -91,20 +91,20 @@ def test_check_lists_every_error_and_warning_and_fails(c2iql, tmp_path, dataset)
 
 def test_check_of_a_file_without_a_dataset(c2iql, tmp_path):
     (tmp_path / "page.hdf5").write_text("<html>")
-    status, out = c2iql("data", "check", tmp_path / "page.hdf5", "--task", "CarRun")
-    assert status.endswith("not usable for CarRun: errors: 1")
+    status, out, err = c2iql("data", "check", tmp_path / "page.hdf5", "--task", "CarRun")
+    assert status == 2 and err.endswith("not usable for CarRun: errors: 1\n")
     assert out.startswith(f"ERROR {tmp_path}/page.hdf5: not an HDF5 file") and "episodes" not in out
 
 
 def test_check_where_no_episode_keeps_a_limit(c2iql, tmp_path, dataset):
     path = write_dataset(tmp_path / "a.hdf5", dataset.select([4]), "CarRun")
-    status, out = c2iql("data", "check", path, "--task", "CarRun")
-    assert status is None and ["10", "0.0%", "NaN", "0"] in rows_of(out)
+    status, out, err = c2iql("data", "check", path, "--task", "CarRun")
+    assert status == 0 and ["10", "0.0%", "NaN", "0"] in rows_of(out)
 
 
 def test_check_of_an_unknown_task(c2iql, tmp_path):
-    status, _ = c2iql("data", "check", tmp_path / "a.hdf5", "--task", "CarRum")
-    assert "unknown task 'CarRum': did you mean CarRun" in status
+    status, _, err = c2iql("data", "check", tmp_path / "a.hdf5", "--task", "CarRum")
+    assert status == 2 and "unknown task 'CarRum': did you mean CarRun" in err
 
 
 def test_convert_and_export_hand_their_arguments_on(c2iql, dataset, monkeypatch, tmp_path):
@@ -115,15 +115,15 @@ def test_convert_and_export_hand_their_arguments_on(c2iql, dataset, monkeypatch,
     monkeypatch.setitem(sys.modules, converting.__name__, converting)
     monkeypatch.setattr("tutorial_lib.data.convert", converting, raising=False)
     source, out = tmp_path / "source", tmp_path / "out.hdf5"
-    status, printed = c2iql("data", "convert", source, "--out", out, "--task", "CarRun")
-    assert status is None and printed == f"{out}: 5 episodes, {5 * T} transitions\n"
-    status, _ = c2iql("data", "export", out, "--task", "CarRun", "--minari", "carrun/mixed-v0")
-    assert status is None
+    status, printed, _ = c2iql("data", "convert", source, "--out", out, "--task", "CarRun")
+    assert status == 0 and printed == f"{out}: 5 episodes, {5 * T} transitions\n"
+    status, _, err = c2iql("data", "export", out, "--task", "CarRun", "--minari", "carrun/mixed-v0")
+    assert status == 0
     assert called == [(source, out, "CarRun"), (out, "CarRun", "carrun/mixed-v0")]
 
 
 @pytest.mark.parametrize("command", ["check", "convert", "export"])
 def test_every_command_has_help_for_its_arguments(c2iql, command):
-    status, out = c2iql("data", command, "--help")
+    status, out, err = c2iql("data", command, "--help")
     assert status == 0 and f"usage: c2iql data {command}" in out and "PATH" in out and "--task" in out
     assert command in c2iql("data", "--help")[1]

@@ -85,7 +85,7 @@ def test_an_algorithm_has_a_page(site, name):
     assert first_cells(scalars) == list(kind.scalars)
     tasks = list(results.loc[results["algorithm"] == name, "task"].unique())
     assert first_cells(section(page, "Results")) == tasks
-    assert bool(tasks) == kind.in_table1
+    assert kind.in_table1 or not tasks
 
 
 def section(page: str, title: str) -> str:

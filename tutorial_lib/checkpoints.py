@@ -23,6 +23,8 @@ CHECKPOINT = "checkpoint.safetensors"
 """The file of a run's folder from which training continues."""
 METRICS = "metrics.csv"
 """The file of a run's folder with the log of its training."""
+NEWER_OPTIONS = {"thresholds": "set", "infinite_share": 0.1, "clock": False, "price_unit": "return"}
+"""The options that the shipped agents' files do not name yet, and what these agents were trained with."""
 LARGEST_OPTION = 100_000_000
 """No option that is a whole number is larger in the file of an agent."""
 DAMAGED = (
@@ -153,6 +155,7 @@ def _parsed(metadata: dict[str, str]) -> Header:
     if not isinstance(options, dict) or not isinstance(seeds, list) or not isinstance(data, str | None):
         raise ValueError("the header has an entry of another type")
     own = {field.name for field in dataclasses.fields(kind.Config)}
+    options = {name: value for name, value in NEWER_OPTIONS.items() if name in own} | options
     if odd := sorted(own ^ set(options)):  # a default in a missing option's place might not be what it was
         raise ValueError(f"these options are missing or unknown: {', '.join(map(repr, odd))}")
     for name, value in options.items():

@@ -55,6 +55,16 @@ def priced_q(
     return q_reward - price * ((cost - limit).clamp(min=0.0) - (state_cost - limit).clamp(min=0.0))
 
 
+def spread(values: Tensor, weight: Tensor) -> Tensor:
+    """Returns the standard deviation of values (B,) with weights (B,) that are not negative, ().
+
+    It is zero where all weights are.
+    """
+    weight = weight / weight.sum().clamp(min=1e-6)
+    mean = (weight * values).sum()
+    return (weight * (values - mean).square()).sum().sqrt()
+
+
 def td_target(reward: Tensor, gamma: Tensor | float, next_value: Tensor, mask: Tensor) -> Tensor:
     """Returns r + gamma mask V(s') (eqs. 7 and 16). `mask` is 0 where nothing follows, and 1 elsewhere.
 

@@ -41,7 +41,13 @@ from tutorial_lib import losses
 from tutorial_lib.agents.implicit import ConstrainedAgent, ConstrainedConfig
 from tutorial_lib.agents.player import Player
 from tutorial_lib.agents.seeds import Fields, Networks
-from tutorial_lib.costs.conditioning import ConditioningConfig, draw_thresholds, encode, told_limit
+from tutorial_lib.costs.conditioning import (
+    ConditioningConfig,
+    after_step,
+    draw_thresholds,
+    encode,
+    told_limit,
+)
 from tutorial_lib.costs.discounting import average_threshold
 from tutorial_lib.costs.reconstruction import (
     CostReconstruction,
@@ -93,12 +99,15 @@ class BudgetPlayer(Player):
         remaining = config.time_limits == "mask"  # the critics then predict the remaining cost
         return told_limit(self.agent.task, config, self.limits, self.spent, self.t, remaining)
 
+    def act(self, observations: np.ndarray) -> np.ndarray:
+        return self.agent.act(observations, self.told, self.run, self.t)
+
     def see(self, rewards: np.ndarray, costs: np.ndarray) -> None:
         """Counts the costs (E,) of the step."""
         self.spent, self.t = self.spent + costs, self.t + 1
 
     def predicted_cost(self, observations: np.ndarray) -> np.ndarray:
-        return self.agent.predicted_cost(observations, self.told, self.run)
+        return self.agent.predicted_cost(observations, self.told, self.run, self.t)
 
 
 class C2IQL(ConstrainedAgent):
@@ -118,6 +127,8 @@ class C2IQL(ConstrainedAgent):
 
     def __init__(self, task: Task, config: Any, *args: Any, **kwargs: Any):
         super().__init__(task, config, *args, **kwargs)
+        if self.clock and config.time_limits != "mask":
+            raise ValueError("clock=True needs time_limits='mask': its limits are on the remaining cost")
         self.gammas = torch.tensor(self.cost_gammas, device=self.device)  # (m,)
         if self.reconstructs:  # untrained until `prepare` or `load_state`
             with torch.random.fork_rng(devices=[]):
@@ -128,8 +139,13 @@ class C2IQL(ConstrainedAgent):
         return self.task.gammas if self.reconstructs else (self.config.gamma,)
 
     @property
+    def clock(self) -> bool:
+        """True if the networks see the time, and limits shrink by every recorded cost."""
+        return self.conditioned and self.config.clock
+
+    @property
     def extra_inputs(self) -> int:
-        return int(self.conditioned)
+        return int(self.conditioned) + int(self.clock)
 
     def prepare(self, datasets: Sequence[Dataset], progress: bool = True) -> None:
         """Trains the reconstruction model, then does what CIQL does before the first update."""
@@ -144,14 +160,23 @@ class C2IQL(ConstrainedAgent):
         batch = super().draw(data, generator, limit)
         if not self.conditioned:
             return batch
-        return batch | {"limit": draw_thresholds(self.task, self.config, generator)}
+        return batch | {"limit": draw_thresholds(self.task, self.config, batch, generator)}
 
-    def network_input(self, net: Networks, observations: Tensor, limit: Tensor) -> Tensor:
-        """Returns normalised observations with the encoded limit as one more input, (..., obs + 1)."""
+    def network_input(
+        self, net: Networks, observations: Tensor, limit: Tensor, timesteps: Tensor | float = 0.0
+    ) -> Tensor:
+        """Returns normalised observations with the encoded limit as one more input, (..., obs + 1).
+
+        With a `clock`, the share of the episode that is over is another one. `timesteps` (...) are the steps
+        before.
+        """
         observations = super().network_input(net, observations, limit)
         if not self.conditioned:
             return observations
-        return torch.cat([observations, encode(limit, self.task).unsqueeze(-1)], -1)
+        more = [encode(limit, self.task)]
+        if self.clock:
+            more.append(torch.zeros_like(limit) + timesteps / self.task.horizon)
+        return torch.cat([observations, torch.stack(more, -1)], -1)
 
     def episode_cost(self, q_cost: Tensor) -> Tensor:
         """Returns the cost of a whole episode, (...,), for discounted costs (..., m) (lines 6 to 8).
@@ -166,9 +191,12 @@ class C2IQL(ConstrainedAgent):
         return q_cost.squeeze(-1) / average_threshold(1.0, self.config.gamma, horizon)  # L~ / L (eq. 2)
 
     def losses(self, net: Networks, batch: Fields) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-        config, a, limit = self.config, batch.actions, batch.limit
-        s = self.network_input(net, batch.observations, limit)
-        s_next = self.network_input(net, batch.next_observations, limit)  # a limit stands for a cost rate
+        config, a, limit, t = self.config, batch.actions, batch.limit, batch.timesteps
+        s = self.network_input(net, batch.observations, limit, t)
+        # Without a clock, a limit stands for a cost rate, which stays. With one, it is what may still be
+        # paid.
+        next_limit = after_step(limit, batch.costs) if self.clock else limit
+        s_next = self.network_input(net, batch.next_observations, next_limit, t + 1)
 
         # Lines 6-8: cost reconstruction. The critic that predicts the highest cost counts.
         q_cost = net.target_cost_critics(s, a)  # (k, B, m)
@@ -208,20 +236,28 @@ class C2IQL(ConstrainedAgent):
 
         of_networks = {"value": value_loss, "cost_value": cost_value_loss, "critic": critic_loss}
         of_networks |= {"cost_critic": cost_critic_loss, "policy": policy_loss}
-        scalars = self.logged(cost, limit, v, q_reward) | {"cost_mean": cost.mean()}
+        scalars = self.logged(cost, limit, v, q_reward, v_cost) | {"cost_mean": cost.mean()}
         return of_networks, scalars
 
     def player(self, limits: Sequence[float] | np.ndarray, seeds: Sequence[int], run: int = 0) -> Player:
         return BudgetPlayer(self, limits, run) if self.conditioned else super().player(limits, seeds, run)
 
-    def predicted_cost(self, observations: np.ndarray, limits: np.ndarray, run: int = 0) -> np.ndarray:
+    def act(self, observations: np.ndarray, limits: np.ndarray, run: int = 0, t: int = 0) -> np.ndarray:
+        """Returns the mean actions (E, act) at observations (E, obs) of step t under limits (E,)."""
+        with torch.no_grad():
+            net, x = self.networks(run), (self._tensor(observations), self._tensor(limits))
+            return net.policy(self.network_input(net, *x, t))[0].cpu().numpy()
+
+    def predicted_cost(
+        self, observations: np.ndarray, limits: np.ndarray, run: int = 0, t: int = 0
+    ) -> np.ndarray:
         """Returns the cost of an episode, (E,), that the highest cost critic predicts for the mean action.
 
-        It is in unsafe steps per episode. The observations are (E, obs) and the limits are (E,).
+        It is in unsafe steps per episode. The observations of step t are (E, obs) and the limits are (E,).
         """
         with torch.no_grad():
-            net = self.networks(run)
-            s = self.network_input(net, self._tensor(observations), self._tensor(limits))
+            net, x = self.networks(run), (self._tensor(observations), self._tensor(limits))
+            s = self.network_input(net, *x, t)
             action, _ = net.policy(s)
             return self.episode_cost(net.cost_critics(s, action)).amax(0).cpu().numpy()
 

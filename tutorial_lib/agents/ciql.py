@@ -81,4 +81,4 @@ class CIQL(ConstrainedAgent):
 
         of_networks = {"value": value_loss, "cost_value": cost_value_loss, "critic": critic_loss}
         of_networks |= {"cost_critic": cost_critic_loss, "policy": policy_loss}
-        return of_networks, self.logged(cost, limit, v, q_reward)
+        return of_networks, self.logged(cost, limit, v, q_reward, v_cost)

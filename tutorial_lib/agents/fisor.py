@@ -63,7 +63,7 @@ class FISORConfig(CriticConfig):
     """The weight of actions with Q_h < V_h in the loss of V_h, as in FISOR's code. That of other actions is
     one minus this."""
     unsafe_step: Annotated[float, NOT_NEGATIVE] = 25.0
-    """h of a step that costs, as in FISOR's code. That of a step that costs nothing is -1."""
+    """The value h of a step that costs, as in FISOR's code. That of a step that costs nothing is -1."""
     reward_factor: Annotated[float, NOT_NEGATIVE] = 3.0
     """The factor of the advantage in the weights at feasible states, as in FISOR's code. The advantage is in
     the unit in which returns have the range T."""

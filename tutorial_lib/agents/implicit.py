@@ -2,8 +2,9 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
+import torch
 from torch import Tensor, nn
 
 from tutorial_lib import losses
@@ -12,6 +13,9 @@ from tutorial_lib.agents.seeds import Fields, Networks, Rates
 from tutorial_lib.config import COUNT, NOT_NEGATIVE, SHARE
 from tutorial_lib.data.dataset import Dataset
 from tutorial_lib.networks import Critics, Policy, Value
+
+EXCHANGE_STEP = 0.01
+"""How far the exchange rate moves towards the ratio of the spreads in each update."""
 
 
 @dataclass(frozen=True)
@@ -44,9 +48,14 @@ class ConstrainedConfig(ImplicitConfig):
     cost_critics: Annotated[int, COUNT] = 2
     """The number of cost critics, of which the highest cost counts. The paper does not give it."""
     unsafe_price: Annotated[float | None, NOT_NEGATIVE] = None
-    """The price of cost beyond the limit, in units of `reward_scale` (discounted reward) per cost range. None
-    means that an unsafe action has the value zero, as in eq. 11. With a number, its value is Q_r minus the
-    price of every unit of cost beyond the limit, which is unsafe_price * reward_scale / cost_range."""
+    """The price of cost beyond the limit, in units of `price_unit`. None means that an unsafe action has the
+    value zero, as in eq. 11. With a number, its value is Q_r minus the price of every unit of cost beyond the
+    limit."""
+    price_unit: Literal["return", "advantage"] = "return"
+    """The unit of `unsafe_price`. With 'return', it is `reward_scale` (discounted reward) per cost range.
+    With 'advantage', it is the spread of the advantages of reward over the spread of those of cost, both over
+    the actions that the limit does not touch. A price in this unit says how much of what an action can earn
+    may be given up for what it can cost, and does not change when rewards or costs are scaled or shifted."""
     recorded_step: bool = False
     """If true, the cost of a recorded action is at least that of its recorded step, c + gamma V_c(s'). The
     critics are smooth, and the recorded step is exact where cost begins (at a speed or at a wall). Of two
@@ -90,7 +99,13 @@ class ConstrainedAgent(ImplicitAgent):
         "safe_fraction": "share of recorded actions whose expected cost keeps the limit",
         "value_mean": "mean of V_r, in discounted reward",
         "negative_q": "share of recorded actions with Q_r < 0, where a penalty of zero is a reward",
+        "reward_spread": "standard deviation of Q_r - V_r where no limit binds, in discounted reward",
+        "cost_spread": "standard deviation of an action's cost minus its state's there, in unsafe steps",
     }
+
+    def __init__(self, *args: Any, **kwargs: Any):
+        super().__init__(*args, **kwargs)
+        self.steps_variables = self.prices_advantages
 
     @property
     def extra_inputs(self) -> int:
@@ -106,13 +121,22 @@ class ConstrainedAgent(ImplicitAgent):
         task, config = self.task, self.config
         inputs = task.obs_dim + self.extra_inputs
         scale, cost_scale = reward_guess(task, config), cost_guess(task, self.cost_gammas)
-        return super().build() | {
+        built = super().build() | {
             "value": Value(inputs, config, scale),
             "cost_value": Value(inputs, config, cost_scale),
             "critics": Critics(inputs, task.act_dim, config, scale),
             "cost_critics": Critics(inputs, task.act_dim, config, cost_scale, k=config.cost_critics),
             "policy": Policy(inputs, task.act_dim, config),
         }
+        if self.prices_advantages:
+            built["exchange_rate"] = torch.tensor(scale / task.cost_range)
+        return built
+
+    def measure(self, dataset: Dataset) -> dict[str, Tensor]:
+        measured = super().measure(dataset)
+        if self.prices_advantages:  # a first guess
+            measured["exchange_rate"] = measured["reward_scale"] / self.task.cost_range
+        return measured
 
     def prepare(self, datasets: Sequence[Dataset], progress: bool = True) -> None:
         """Measures each run's variables, and lets all cost heads start at the dataset's cost rate.
@@ -136,9 +160,15 @@ class ConstrainedAgent(ImplicitAgent):
         """Returns 1 where Q_c bootstraps and 0 where nothing follows, (B,)."""
         return goes_on(batch, self.config.time_limits)
 
-    def logged(self, cost: Tensor, limit: Tensor, v: Tensor, q_reward: Tensor) -> dict[str, Tensor]:
-        """Returns what the log says besides the losses. Costs, limits, V_r and Q_r are (B,)."""
-        return {
+    def logged(
+        self, cost: Tensor, limit: Tensor, v: Tensor, q_reward: Tensor, v_cost: Tensor
+    ) -> dict[str, Tensor]:
+        """Returns what the log says besides the losses.
+
+        Costs, limits, V_r and Q_r are (B,), and the heads of V_c are (B, m).
+        """
+        spreads = self.spreads(q_reward, v, cost, v_cost, limit) if self.prices_advantages else {}
+        return spreads | {
             "safe_fraction": (cost <= limit).float().mean(),
             "value_mean": v.mean(),
             "negative_q": (q_reward < 0).float().mean(),
@@ -154,8 +184,39 @@ class ConstrainedAgent(ImplicitAgent):
         """
         if self.config.unsafe_price is None:
             return losses.penalised_q(q_reward, cost, limit)
-        price = self.config.unsafe_price * net.reward_scale / self.task.cost_range
-        return losses.priced_q(q_reward, cost, self.episode_cost(value_cost.detach()), limit, price)
+        unit = net.reward_scale / self.task.cost_range
+        if self.prices_advantages:
+            unit = net.exchange_rate
+        state_cost = self.episode_cost(value_cost.detach())
+        return losses.priced_q(q_reward, cost, state_cost, limit, self.config.unsafe_price * unit)
+
+    def spreads(
+        self, q_reward: Tensor, v: Tensor, cost: Tensor, value_cost: Tensor, limit: Tensor
+    ) -> dict[str, Tensor]:
+        """Returns the standard deviations of both advantages over the actions that the limit does not touch.
+
+        These are the actions whose cost and whose state's cost keep the limit. Q_r, V_r, costs and limits are
+        (B,), and the heads of V_c are (B, m). Where there are fewer than two such actions, both are zero.
+        """
+        state_cost = self.episode_cost(value_cost)
+        untouched = (torch.maximum(cost, state_cost) <= limit).float()
+        return {
+            "reward_spread": losses.spread(q_reward - v, untouched).detach(),
+            "cost_spread": losses.spread(cost - state_cost, untouched).detach(),
+        }
+
+    def step(self, net: Networks, batch: Fields, scalars: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Returns the exchange rate, which follows the ratio of the two spreads slowly."""
+        if not self.prices_advantages:
+            return {}
+        reward, cost = scalars["reward_spread"], scalars["cost_spread"]
+        ratio = torch.where(cost > 0, reward / cost.clamp(min=1e-6), net.exchange_rate)
+        return {"exchange_rate": net.exchange_rate + EXCHANGE_STEP * (ratio - net.exchange_rate)}
+
+    @property
+    def prices_advantages(self) -> bool:
+        """True if the price is in units of the advantages' spreads."""
+        return self.config.unsafe_price is not None and self.config.price_unit == "advantage"
 
     @property
     def penalty_is_zero(self) -> bool:

@@ -4,15 +4,16 @@ Limits, budgets and costs are in unsafe steps per episode.
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from tutorial_lib.config import Config
+from tutorial_lib.config import SHARE, Config
 from tutorial_lib.tasks import Task
 
 
@@ -20,6 +21,17 @@ from tutorial_lib.tasks import Task
 class ConditioningConfig(Config):
     """The options of constraint conditioning."""
 
+    thresholds: Literal["set", "range", "episode"] = "set"
+    """Where the thresholds of training come from. With 'set', they are the paper's: small, middle, high and
+    infinity (Appendix B.2). With 'range', they are uniform between zero and the task's cost range. With
+    'episode', a transition's threshold is the cost that its own episode still has (rescaled to a whole
+    episode where there is no `clock`). So the networks learn from pairs of state and threshold that occur."""
+    infinite_share: Annotated[float, SHARE] = 0.1
+    """The share of infinite thresholds where they do not come from the set."""
+    clock: bool = False
+    """If true, the networks also see the share of the episode that is over, and a threshold shrinks by every
+    recorded cost: after a step of cost c, a threshold L has become max(L - c, 0). A threshold is then a limit
+    on the remaining cost, so `time_limits` must be 'mask'."""
     thresholds_per: Literal["sample", "batch"] = "sample"
     """Whether one threshold is drawn per transition ('sample') or per batch ('batch'). Line 5 of Algorithm 2
     can be read as one per batch. One per transition has the lower variance."""
@@ -54,15 +66,33 @@ def encode(threshold: Tensor | np.ndarray | float, task: Task) -> Tensor:
     return torch.where(threshold.isinf(), INFINITE_CODE, threshold / task.cost_range)
 
 
-def draw_thresholds(task: Task, config: ConditioningConfig, generator: torch.Generator) -> Tensor:
-    """Returns thresholds for one run's batch, drawn uniformly from the threshold set, (batch_size,) (line 5).
+def draw_thresholds(
+    task: Task, config: ConditioningConfig, batch: Mapping[str, Tensor], generator: torch.Generator
+) -> Tensor:
+    """Returns thresholds for one run's batch of transitions, (batch_size,) (line 5).
 
-    The paper does not say whether it draws one per batch or one per transition. One per transition has the
-    lower variance.
+    With `thresholds='set'`, they are drawn uniformly from the threshold set. The paper does not say whether
+    it draws one per batch or one per transition. One per transition has the lower variance. Otherwise a share
+    `infinite_share` of them is infinite, and the others are uniform on the cost range, or what `batch` says
+    that each episode still costs.
     """
-    choices = torch.as_tensor(threshold_set(task, with_zero=config.zero_threshold), dtype=torch.float32)
     draws = config.batch_size if config.thresholds_per == "sample" else 1
-    return choices[torch.randint(len(choices), (draws,), generator=generator)].expand(config.batch_size)
+    if config.thresholds == "set":
+        choices = torch.as_tensor(threshold_set(task, with_zero=config.zero_threshold), dtype=torch.float32)
+        return choices[torch.randint(len(choices), (draws,), generator=generator)].expand(config.batch_size)
+    infinite = torch.rand(draws, generator=generator) < config.infinite_share
+    if config.thresholds == "range":
+        finite = task.cost_range * torch.rand(draws, generator=generator)
+        return torch.where(infinite, torch.inf, finite).expand(config.batch_size)
+    finite = batch["costs_to_go"].cpu()
+    if not config.clock:
+        finite = finite * task.horizon / (task.horizon - batch["timesteps"].cpu())
+    return torch.where(infinite, torch.inf, finite)
+
+
+def after_step(threshold: Tensor, cost: Tensor) -> Tensor:
+    """Returns max(L - c, 0), (B,): what is left of thresholds L (B,) after a step of cost c (B,)."""
+    return (threshold - cost).clamp(min=0)
 
 
 def check_limit(limit: float) -> float:
@@ -111,14 +141,17 @@ def told_limit(
 ) -> np.ndarray:
     """Returns the limit that a conditioned policy is told at step t, (E,).
 
-    It is the element of the threshold set that is nearest to the rescaled budget of eq. 23. `limits` (E,) are
-    the limits of E episodes, and `spent` (E,) is what each has cost so far. With `remaining`, the critics
+    It is the element of the threshold set that is nearest to the rescaled budget of eq. 23. Where thresholds
+    do not come from the set, it is the budget itself, between zero and the task's cost range. `limits` (E,)
+    are the limits of E episodes, and `spent` (E,) is what each has cost so far. With `remaining`, the critics
     predict the remaining cost and not that of a whole episode, so the budget is not rescaled.
     """
     budget = limits - spent if remaining else rescaled_budget(limits, spent, t, task.horizon)
-    chosen = nearest_threshold(
-        budget, task, with_infinite=config.infinite_at_test == "nearest", with_zero=config.zero_threshold
-    )
+    if config.thresholds == "set":
+        with_infinite = config.infinite_at_test == "nearest"
+        chosen = nearest_threshold(budget, task, with_infinite, with_zero=config.zero_threshold)
+    else:  # every threshold was trained on, so the budget itself is told
+        chosen = np.clip(budget, 0.0, task.cost_range)
     if config.infinite_at_test == "covered":
         covered = limits - spent >= (task.horizon - t) * task.max_step_cost
         chosen = np.where(covered, np.inf, chosen)

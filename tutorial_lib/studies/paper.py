@@ -27,6 +27,8 @@ TABLE1: dict[str, dict[str, tuple[float, float]]] = {
 }
 """The paper's Table 1: normalised reward and cost by algorithm and task, means over seeds and limits."""
 
+OUR_NAMES = {"WSAC": "WSAC-style"}
+"""What we call the systems of Table 1 whose exact form was not published."""
 TABLE1_AVERAGES = {
     "BCQ-Lag": (0.69, 1.05),
     "BEAR-Lag": (0.49, 1.49),

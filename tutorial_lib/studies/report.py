@@ -21,7 +21,7 @@ from tutorial_lib.files import check_output, written_whole
 from tutorial_lib.scores import with_scores
 from tutorial_lib.studies.figures import cost_return_plane, expected_costs, study_figure
 from tutorial_lib.studies.grids import STUDIES, get_study, varied_options
-from tutorial_lib.studies.paper import CLAIMS, TABLE1
+from tutorial_lib.studies.paper import CLAIMS, OUR_NAMES, TABLE1
 from tutorial_lib.studies.results import (
     RESULTS,
     SCORES,
@@ -99,7 +99,11 @@ def baselines_table() -> str:
     found = over_seeds(results).set_index(["algorithm", "task"])
     run = found.index.get_level_values(0).unique()
     ours = [name for name, kind in ALGORITHMS.items() if kind.in_table1]
-    missing = [name for name in dict.fromkeys((*ours, *TABLE1)) if name not in run]
+    missing = [
+        name
+        for name in dict.fromkeys((*ours, *(OUR_NAMES.get(name, name) for name in TABLE1)))
+        if name not in run
+    ]
     rows, tasks = [], [task for task in TASKS if task in TABLE1["C2IQL"]]
     for name in run:
         row = {"": name, "seeds": found.loc[name, "seeds"].min()}
