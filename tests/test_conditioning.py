@@ -178,12 +178,11 @@ def test_a_remaining_budget_is_not_rescaled():
 
 
 def test_where_all_thresholds_were_trained_on_the_budget_itself_is_told():
-    for thresholds in ("range", "episode"):
-        assert told(20, 5, 100, thresholds=thresholds) == [30]
-        assert told(20, 5, 100, thresholds=thresholds, remaining=True) == [15]
-        assert told(20, 25, 100, thresholds=thresholds) == [0]
-        assert told(150, 0, 10, thresholds=thresholds, remaining=True) == [40]  # CarRun's cost range
-        assert told(20, 10, 190, thresholds=thresholds) == [math.inf]  # covered
+    assert told(20, 5, 100, thresholds="range") == [30]
+    assert told(20, 5, 100, thresholds="range", remaining=True) == [15]
+    assert told(20, 25, 100, thresholds="range") == [0]
+    assert told(150, 0, 10, thresholds="range", remaining=True) == [40]  # CarRun's cost range
+    assert told(20, 10, 190, thresholds="range") == [math.inf]  # covered
 
 
 def test_a_threshold_shrinks_by_what_is_paid_and_never_below_zero():

@@ -7,7 +7,7 @@ import json
 import math
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -23,7 +23,10 @@ CHECKPOINT = "checkpoint.safetensors"
 """The file of a run's folder from which training continues."""
 METRICS = "metrics.csv"
 """The file of a run's folder with the log of its training."""
-NEWER_OPTIONS = {"thresholds": "set", "infinite_share": 0.1, "clock": False, "price_unit": "return"}
+NEWER_OPTIONS: dict[str, Any] = {
+    "thresholds": "set", "infinite_share": 0.15, "zero_share": 0.1, "episode_share": 0.5,
+    "clock": False, "price_unit": "return",
+}  # fmt: skip
 """The options that the shipped agents' files do not name yet, and what these agents were trained with."""
 LARGEST_OPTION = 100_000_000
 """No option that is a whole number is larger in the file of an agent."""

@@ -21,13 +21,19 @@ from tutorial_lib.tasks import Task
 class ConditioningConfig(Config):
     """The options of constraint conditioning."""
 
-    thresholds: Literal["set", "range", "episode"] = "set"
+    thresholds: Literal["set", "range"] = "set"
     """Where the thresholds of training come from. With 'set', they are the paper's: small, middle, high and
-    infinity (Appendix B.2). With 'range', they are uniform between zero and the task's cost range. With
-    'episode', a transition's threshold is the cost that its own episode still has (rescaled to a whole
-    episode where there is no `clock`). So the networks learn from pairs of state and threshold that occur."""
-    infinite_share: Annotated[float, SHARE] = 0.1
-    """The share of infinite thresholds where they do not come from the set."""
+    infinity (Appendix B.2). With 'range', any limit can be told: they are infinite, zero, what the own
+    episode still costs, or uniform between zero and the task's cost range, in the shares below."""
+    infinite_share: Annotated[float, SHARE] = 0.15
+    """The share of infinite thresholds, with thresholds='range'."""
+    zero_share: Annotated[float, SHARE] = 0.1
+    """The share of zero thresholds, with thresholds='range'."""
+    episode_share: Annotated[float, SHARE] = 0.5
+    """Of the other thresholds with thresholds='range', the share that is the cost that the transition's own
+    episode still has (rescaled to a whole episode where there is no `clock`). Such pairs of state and
+    threshold occur, and uniform ones mostly do not. But an episode can cost little by luck, so that all
+    thresholds of this kind would promise too much."""
     clock: bool = False
     """If true, the networks also see the share of the episode that is over, and a threshold shrinks by every
     recorded cost: after a step of cost c, a threshold L has become max(L - c, 0). A threshold is then a limit
@@ -72,22 +78,20 @@ def draw_thresholds(
     """Returns thresholds for one run's batch of transitions, (batch_size,) (line 5).
 
     With `thresholds='set'`, they are drawn uniformly from the threshold set. The paper does not say whether
-    it draws one per batch or one per transition. One per transition has the lower variance. Otherwise a share
-    `infinite_share` of them is infinite, and the others are uniform on the cost range, or what `batch` says
-    that each episode still costs.
+    it draws one per batch or one per transition. One per transition has the lower variance. With 'range',
+    `batch` says what each episode still costs, and `ConditioningConfig` has the shares.
     """
-    draws = config.batch_size if config.thresholds_per == "sample" else 1
     if config.thresholds == "set":
         choices = torch.as_tensor(threshold_set(task, with_zero=config.zero_threshold), dtype=torch.float32)
+        draws = config.batch_size if config.thresholds_per == "sample" else 1
         return choices[torch.randint(len(choices), (draws,), generator=generator)].expand(config.batch_size)
-    infinite = torch.rand(draws, generator=generator) < config.infinite_share
-    if config.thresholds == "range":
-        finite = task.cost_range * torch.rand(draws, generator=generator)
-        return torch.where(infinite, torch.inf, finite).expand(config.batch_size)
-    finite = batch["costs_to_go"].cpu()
+    own = batch["costs_to_go"].cpu()
     if not config.clock:
-        finite = finite * task.horizon / (task.horizon - batch["timesteps"].cpu())
-    return torch.where(infinite, torch.inf, finite)
+        own = own * task.horizon / (task.horizon - batch["timesteps"].cpu())
+    kind, which, place = torch.rand(3, config.batch_size, generator=generator)
+    finite = torch.where(which < config.episode_share, own, place * task.cost_range)
+    finite = torch.where(kind < config.infinite_share + config.zero_share, 0.0, finite)
+    return torch.where(kind < config.infinite_share, torch.inf, finite)
 
 
 def after_step(threshold: Tensor, cost: Tensor) -> Tensor:
