@@ -55,7 +55,7 @@ def test_a_limit_that_is_negative_or_no_number_is_an_error_that_shows_it(limit):
 @pytest.mark.parametrize("zero", [False, True])
 def test_thresholds_are_drawn_from_the_whole_set_in_equal_shares(zero):
     config = ConditioningConfig(batch_size=5_000, zero_threshold=zero)
-    draws = draw_thresholds(CAR_RUN, config, {}, torch.Generator().manual_seed(0))
+    draws = draw_thresholds(CAR_RUN, config, torch.Generator().manual_seed(0))
     expected = [0.0] * zero + [10, 20, 40, math.inf]
     assert draws.dtype == torch.float32 and sorted(set(draws.tolist())) == expected
     shares = [(draws == threshold).float().mean().item() for threshold in expected]

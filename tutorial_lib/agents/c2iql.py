@@ -160,7 +160,7 @@ class C2IQL(ConstrainedAgent):
         batch = super().draw(data, generator, limit)
         if not self.conditioned:
             return batch
-        return batch | {"limit": draw_thresholds(self.task, self.config, batch, generator)}
+        return batch | {"limit": draw_thresholds(self.task, self.config, generator, batch)}
 
     def network_input(
         self, net: Networks, observations: Tensor, limit: Tensor, timesteps: Tensor | float = 0.0
@@ -178,6 +178,14 @@ class C2IQL(ConstrainedAgent):
             more.append(torch.zeros_like(limit) + timesteps / self.task.horizon)
         return torch.cat([observations, torch.stack(more, -1)], -1)
 
+    def _inputs(self, net: Networks, batch: Fields) -> tuple[Tensor, Tensor]:
+        """Returns the networks' inputs at s and at s', both (B, inputs)."""
+        limit, t = batch.limit, batch.timesteps
+        # Without a clock, a limit stands for a cost rate, which stays. With one, a cost uses it up.
+        left = after_step(limit, batch.costs) if self.clock else limit
+        s = self.network_input(net, batch.observations, limit, t)
+        return s, self.network_input(net, batch.next_observations, left, t + 1)
+
     def episode_cost(self, q_cost: Tensor) -> Tensor:
         """Returns the cost of a whole episode, (...,), for discounted costs (..., m) (lines 6 to 8).
 
@@ -191,12 +199,8 @@ class C2IQL(ConstrainedAgent):
         return q_cost.squeeze(-1) / average_threshold(1.0, self.config.gamma, horizon)  # L~ / L (eq. 2)
 
     def losses(self, net: Networks, batch: Fields) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-        config, a, limit, t = self.config, batch.actions, batch.limit, batch.timesteps
-        s = self.network_input(net, batch.observations, limit, t)
-        # Without a clock, a limit stands for a cost rate, which stays. With one, it is what may still be
-        # paid.
-        next_limit = after_step(limit, batch.costs) if self.clock else limit
-        s_next = self.network_input(net, batch.next_observations, next_limit, t + 1)
+        config, a, limit = self.config, batch.actions, batch.limit
+        s, s_next = self._inputs(net, batch)
 
         # Lines 6-8: cost reconstruction. The critic that predicts the highest cost counts.
         q_cost = net.target_cost_critics(s, a)  # (k, B, m)

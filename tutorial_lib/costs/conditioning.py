@@ -73,7 +73,10 @@ def encode(threshold: Tensor | np.ndarray | float, task: Task) -> Tensor:
 
 
 def draw_thresholds(
-    task: Task, config: ConditioningConfig, batch: Mapping[str, Tensor], generator: torch.Generator
+    task: Task,
+    config: ConditioningConfig,
+    generator: torch.Generator,
+    batch: Mapping[str, Tensor] | None = None,
 ) -> Tensor:
     """Returns thresholds for one run's batch of transitions, (batch_size,) (line 5).
 
@@ -85,6 +88,8 @@ def draw_thresholds(
         choices = torch.as_tensor(threshold_set(task, with_zero=config.zero_threshold), dtype=torch.float32)
         draws = config.batch_size if config.thresholds_per == "sample" else 1
         return choices[torch.randint(len(choices), (draws,), generator=generator)].expand(config.batch_size)
+    if batch is None:
+        raise ValueError("thresholds='range' needs the batch: it says what each episode still costs")
     own = batch["costs_to_go"].cpu()
     if not config.clock:
         own = own * task.horizon / (task.horizon - batch["timesteps"].cpu())
