@@ -177,6 +177,9 @@ def test_it_runs_as_a_module():
     [
         (["train", "BallRum"], "unknown task 'BallRum': did you mean BallRun"),
         (["fetch", "Hopper"], "unknown task 'Hopper'"),
+        (["fetch"], "fetch: name a task, e.g. `c2iql fetch CarCircle`, or write `c2iql fetch --course`"),
+        (["fetch", "CarRun", "--course"], "fetch: name a task"),
+        (["fetch", "--course"], "this clone has the course's files: nothing to fetch"),
         (["collect", "AntCircl"], "unknown task 'AntCircl': did you mean AntCircle"),
         (["train", "SAC", "BallRun"], "unknown algorithm 'SAC': the algorithms are IQL"),
         (["train", "BallRun", "CarRun"], "unknown algorithm 'BallRun': the algorithms are IQL"),

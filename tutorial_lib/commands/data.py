@@ -21,16 +21,26 @@ def tasks() -> None:
     print(pd.DataFrame(rows).to_string(index=False))
 
 
-def fetch(task: tyro.conf.Positional[str], directory: Path | None = None) -> None:
-    """Download DSRL's dataset of a task and check it.
+def fetch(
+    task: tyro.conf.Positional[str | None] = None, directory: Path | None = None, course: bool = False
+) -> None:
+    """Download DSRL's dataset of a task and check it, or the files of the course.
 
     Args:
         task: This is the name of the task, e.g. CarCircle.
-        directory: The file is written to this folder. The default is DSRL_DATASET_DIR or ~/.dsrl/datasets.
+        directory: The file is written to this folder. The default is DSRL_DATASET_DIR or ~/.dsrl/datasets,
+            and for the course's files C2IQL_DATA or ~/.c2iql.
+        course: The command brings the datasets, agents and results that a clone of the project has.
     """
+    from tutorial_lib.data.release import fetch_course
     from tutorial_lib.data.sources import fetch_dataset
 
-    fetch_dataset(task, directory)
+    if course and task is None:
+        fetch_course(folder=directory)
+    elif task is not None and not course:
+        fetch_dataset(task, directory)
+    else:
+        raise ValueError("fetch: name a task, e.g. `c2iql fetch CarCircle`, or write `c2iql fetch --course`")
 
 
 def collect(
