@@ -425,9 +425,9 @@ def test_a_number_that_is_asked_for_or_a_mixed_device_is_noticed(elsewhere, data
     (batch,) = random_batches(dataset, agent, 1)
     encode = agent.network_input
 
-    def asks(net, observations, limit):
+    def asks(net, observations, limit, timesteps):
         assert limit.mean().item() > 0
-        return encode(net, observations, limit)
+        return encode(net, observations, limit, timesteps)
 
     agent.network_input = asks
     with pytest.raises(RuntimeError, match="item"):
