@@ -21,6 +21,7 @@ class Bound(NamedTuple):
 
 SHARE = Bound(lambda x: 0 < x < 1, "between 0 and 1")
 STEP = Bound(lambda x: 0 < x <= 1, "above 0 and at most 1")
+POSITIVE = Bound(lambda x: x > 0, "above 0")
 NOT_NEGATIVE = Bound(lambda x: x >= 0, "0 or more")
 COUNT = Bound(lambda x: x >= 1, "1 or more")
 PAIR = Bound(lambda x: x >= 2, "2 or more")

@@ -35,7 +35,7 @@ import torch
 from torch import Tensor, nn
 
 from tutorial_lib.agents.agent import Agent
-from tutorial_lib.agents.player import Player
+from tutorial_lib.agents.player import CountingPlayer, Player
 from tutorial_lib.agents.seeds import Fields, Networks, Rates
 from tutorial_lib.config import NOT_NEGATIVE, Config
 from tutorial_lib.data.dataset import Dataset, DatasetError
@@ -125,28 +125,6 @@ class BCFrontier(BCAll):
         return super().select(dataset.select(near), limit)
 
 
-class RemainingPlayer(Player):
-    """A player that tells the policy at every step what is left of the limit, and the time."""
-
-    agent: "BCBudget"
-
-    def __init__(self, agent: "BCBudget", limits: Sequence[float] | np.ndarray, run: int = 0):
-        super().__init__(agent, limits, run)
-        self.spent, self.t = np.zeros(len(self.limits)), 0
-
-    @property
-    def told(self) -> np.ndarray:
-        """What is left of the limit at this step, and zero where it is exceeded, (E,)."""
-        return np.maximum(self.limits - self.spent, 0.0)
-
-    def act(self, observations: np.ndarray) -> np.ndarray:
-        return self.agent.act(observations, self.told, self.run, self.t)
-
-    def see(self, rewards: np.ndarray, costs: np.ndarray) -> None:
-        """Counts the costs (E,) of the step."""
-        self.spent, self.t = self.spent + costs, self.t + 1
-
-
 class BCBudget(BCAll):
     """Clones every episode, given the cost that the episode still has. Playing, it is told what is left.
 
@@ -182,4 +160,4 @@ class BCBudget(BCAll):
             return action.cpu().numpy()
 
     def player(self, limits: Sequence[float] | np.ndarray, seeds: Sequence[int], run: int = 0) -> Player:
-        return RemainingPlayer(self, limits, run)
+        return CountingPlayer(self, limits, run)

@@ -26,11 +26,9 @@ from torch import Tensor, nn
 
 from tutorial_lib.agents.lagrangian import LagrangianAgent, LagrangianConfig
 from tutorial_lib.agents.seeds import Fields, Networks
-from tutorial_lib.config import COUNT, NOT_NEGATIVE, Bound
+from tutorial_lib.config import COUNT, NOT_NEGATIVE, POSITIVE
 from tutorial_lib.data.dataset import Batch
 from tutorial_lib.networks import SquashedPolicy
-
-POSITIVE = Bound(lambda x: x > 0, "above 0")
 
 
 @dataclass(frozen=True)

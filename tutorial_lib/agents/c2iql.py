@@ -39,7 +39,7 @@ from torch import Tensor
 
 from tutorial_lib import losses
 from tutorial_lib.agents.implicit import ConstrainedAgent, ConstrainedConfig
-from tutorial_lib.agents.player import Player
+from tutorial_lib.agents.player import CountingPlayer, Player
 from tutorial_lib.agents.seeds import Fields, Networks
 from tutorial_lib.costs.conditioning import (
     ConditioningConfig,
@@ -83,14 +83,10 @@ class WithoutCCConfig(ConstrainedConfig, ReconstructionConfig):
     """The options of C2IQL without constraint conditioning."""
 
 
-class BudgetPlayer(Player):
+class BudgetPlayer(CountingPlayer):
     """A player that tells the policy at every step what is left of the limit (eq. 23)."""
 
     agent: "C2IQL"
-
-    def __init__(self, agent: "C2IQL", limits: Sequence[float] | np.ndarray, run: int = 0):
-        super().__init__(agent, limits, run)
-        self.spent, self.t = np.zeros(len(self.limits)), 0
 
     @property
     def told(self) -> np.ndarray:
@@ -98,13 +94,6 @@ class BudgetPlayer(Player):
         config = self.agent.config
         remaining = config.time_limits == "mask"  # the critics then predict the remaining cost
         return told_limit(self.agent.task, config, self.limits, self.spent, self.t, remaining)
-
-    def act(self, observations: np.ndarray) -> np.ndarray:
-        return self.agent.act(observations, self.told, self.run, self.t)
-
-    def see(self, rewards: np.ndarray, costs: np.ndarray) -> None:
-        """Counts the costs (E,) of the step."""
-        self.spent, self.t = self.spent + costs, self.t + 1
 
     def predicted_cost(self, observations: np.ndarray) -> np.ndarray:
         return self.agent.predicted_cost(observations, self.told, self.run, self.t)

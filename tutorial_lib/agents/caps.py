@@ -52,7 +52,7 @@ from torch import Tensor, nn
 from tutorial_lib import losses
 from tutorial_lib.agents.critic import cost_guess, goes_on, reward_guess
 from tutorial_lib.agents.implicit import ImplicitAgent, ImplicitConfig
-from tutorial_lib.agents.player import Player
+from tutorial_lib.agents.player import CountingPlayer, Player
 from tutorial_lib.agents.seeds import Fields, Networks
 from tutorial_lib.config import NOT_NEGATIVE, PAIR
 from tutorial_lib.costs.discounting import average_threshold
@@ -112,26 +112,8 @@ def choose_heads(q_reward: Tensor, q_cost: Tensor, threshold: Tensor) -> Tensor:
     return torch.where(fits.any(-1), best, q_cost.argmin(-1))
 
 
-class SwitchingPlayer(Player):
+class SwitchingPlayer(CountingPlayer):
     """A player that lets the agent choose a head at every step, by what is left of the limit and the time."""
-
-    agent: "CAPS"
-
-    def __init__(self, agent: "CAPS", limits: Sequence[float] | np.ndarray, run: int = 0):
-        super().__init__(agent, limits, run)
-        self.spent, self.t = np.zeros(len(self.limits)), 0
-
-    @property
-    def told(self) -> np.ndarray:
-        """What is left of the limit at this step, and zero where it is exceeded, (E,)."""
-        return np.maximum(self.limits - self.spent, 0.0)
-
-    def act(self, observations: np.ndarray) -> np.ndarray:
-        return self.agent.act(observations, self.told, self.run, self.t)
-
-    def see(self, rewards: np.ndarray, costs: np.ndarray) -> None:
-        """Counts the costs (E,) of the step."""
-        self.spent, self.t = self.spent + costs, self.t + 1
 
     def predicted_cost(self, observations: np.ndarray) -> np.ndarray:
         """Returns the cost so far plus the cost of the remaining steps that the agent predicts, (E,)."""

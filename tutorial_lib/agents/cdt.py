@@ -63,12 +63,11 @@ from tutorial_lib.agents.sequences import (
     sequences,
     totals,
 )
-from tutorial_lib.config import COUNT, NOT_NEGATIVE, PAIR, Bound, Config
+from tutorial_lib.config import COUNT, NOT_NEGATIVE, PAIR, POSITIVE, Bound, Config
 from tutorial_lib.data.dataset import Batch, Dataset
 from tutorial_lib.data.recordings import best_left
 from tutorial_lib.networks import gaussian_log_prob
 
-POSITIVE = Bound(lambda x: x > 0, "above 0")
 PART = Bound(lambda x: 0 <= x < 1, "0 or more, and below 1")
 
 TARGET_ENTROPY = -1.0

@@ -48,11 +48,9 @@ from tutorial_lib import losses
 from tutorial_lib.agents.agent import Agent
 from tutorial_lib.agents.critic import cost_guess, goes_on
 from tutorial_lib.agents.seeds import Fields, Networks, Rates
-from tutorial_lib.config import COUNT, NOT_NEGATIVE, SHARE, Bound, Config
+from tutorial_lib.config import COUNT, NOT_NEGATIVE, POSITIVE, SHARE, Config
 from tutorial_lib.data.dataset import Batch
 from tutorial_lib.networks import Critics, Policy, gaussian_log_prob
-
-POSITIVE = Bound(lambda x: x > 0, "above 0")
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -39,3 +39,29 @@ class Player:
     def predicted_cost(self, observations: np.ndarray) -> np.ndarray:
         """Returns the cost of an episode that the agent predicts at observations (E, obs), (E,), or NaN."""
         return self.agent.predicted_cost(observations, self.limits, self.run)
+
+
+class CountingPlayer(Player):
+    """A player that counts the steps and what they cost.
+
+    At every step it tells the policy what is left of the limit, and the time. The agent's `act` takes the
+    step `t` as another argument.
+    """
+
+    agent: Any
+
+    def __init__(self, agent: Agent, limits: Sequence[float] | np.ndarray, run: int = 0):
+        super().__init__(agent, limits, run)
+        self.spent, self.t = np.zeros(len(self.limits)), 0
+
+    @property
+    def told(self) -> np.ndarray:
+        """What is left of the limit at this step, and zero where it is exceeded, (E,)."""
+        return np.maximum(self.limits - self.spent, 0.0)
+
+    def act(self, observations: np.ndarray) -> np.ndarray:
+        return self.agent.act(observations, self.told, self.run, self.t)
+
+    def see(self, rewards: np.ndarray, costs: np.ndarray) -> None:
+        """Counts the costs (E,) of the step."""
+        self.spent, self.t = self.spent + costs, self.t + 1

@@ -41,12 +41,11 @@ from torch.nn import functional as F
 from tutorial_lib import losses
 from tutorial_lib.agents.critic import CriticAgent, CriticConfig, reward_guess
 from tutorial_lib.agents.seeds import Fields, Networks, Rates
-from tutorial_lib.config import COUNT, NOT_NEGATIVE, Bound, Config
+from tutorial_lib.config import COUNT, NOT_NEGATIVE, POSITIVE, Config
 from tutorial_lib.costs.discounting import average_threshold
 from tutorial_lib.data.dataset import Batch
 from tutorial_lib.networks import Critics, mlp
 
-POSITIVE = Bound(lambda x: x > 0, "above 0")
 LARGEST_MULTIPLIER = 1000.0
 """The largest lambda, in multiplied reward per cost."""
 
