@@ -1,8 +1,11 @@
-"""What several test files share: a browser."""
+"""What several test files share: a browser, and the command line."""
 
 import shutil
+import sys
 
 import pytest
+
+from tutorial_lib.__main__ import main
 
 FLAGS = [
     "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
@@ -22,3 +25,19 @@ def browser():
         chromium = driver.chromium.launch(executable_path=path, args=FLAGS)
         yield chromium
         chromium.close()
+
+
+@pytest.fixture
+def c2iql(monkeypatch, capsys):
+    """Type a command; returns its exit status, what it printed, and what it said went wrong."""
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["c2iql", *map(str, arguments)])
+        status = 0
+        try:
+            main()
+        except SystemExit as error:
+            status = error.code
+        return status, *capsys.readouterr()
+
+    return run

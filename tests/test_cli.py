@@ -34,25 +34,6 @@ TINY_FLAGS = [*TINY_NETWORKS, "--crm-width", 8, "--crm-layers", 1, "--crm-steps"
 
 
 @pytest.fixture
-def c2iql(monkeypatch, capsys):
-    """Type a command; returns its exit status, what it printed, and what it said went wrong."""
-
-    def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["c2iql", *map(str, arguments)])
-        status = 0
-        try:
-            cli.main()
-        except SystemExit as error:
-            status = error.code
-        out, err = capsys.readouterr()
-        if isinstance(status, str):  # what Python itself does with it
-            status, err = 1, err + status + "\n"
-        return status, out, err
-
-    return run
-
-
-@pytest.fixture
 def data(tmp_path):
     """Three random episodes with BallRun's shapes, in a file."""
     rng = np.random.default_rng(0)

@@ -7,7 +7,6 @@ import h5py
 import numpy as np
 import pytest
 
-from tutorial_lib import __main__ as cli
 from tutorial_lib.data.dataset import Dataset
 from tutorial_lib.data.hdf5 import write_dataset
 from tutorial_lib.tasks import TASKS
@@ -15,22 +14,6 @@ from tutorial_lib.tasks import TASKS
 T = TASKS["CarRun"].horizon
 COSTS = (0, 5, 10, 11, 30)
 RETURNS = (100.0, 91.0, 89.0, -20.0, 300.0)
-
-
-@pytest.fixture
-def c2iql(monkeypatch, capsys):
-    """Type a command; returns the exit status (0: well), what it printed, and what it said went wrong."""
-
-    def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["c2iql", *map(str, arguments)])
-        status = 0
-        try:
-            cli.main()
-        except SystemExit as error:
-            status = error.code
-        return status, *capsys.readouterr()
-
-    return run
 
 
 @pytest.fixture
