@@ -1,5 +1,6 @@
-"""Checks say nothing of what they found, but are loud where it is wrong; exercises say what is wrong."""
+"""Checks print what they found and fail loudly where it is wrong; checkers of exercises say what is wrong."""
 
+import configparser
 import importlib
 import re
 from pathlib import Path
@@ -15,9 +16,24 @@ from tutorial_lib.tasks import get_task
 NOTEBOOKS = Path(__file__).parents[1] / "notebooks"
 
 
-def test_check_prints_what_is_expected_and_not_what_was_found(capsys):
-    checks.check("mismatch rate", 0.2371, 0.23, 0.02)
-    assert capsys.readouterr().out == "OK  mismatch rate = 0.23 +/- 0.02\n"
+def test_check_prints_what_was_found_with_one_digit_more_than_the_tolerance(capsys):
+    checks.check("mismatch rate", 0.23713, 0.23, 0.02)
+    assert capsys.readouterr().out == "OK  mismatch rate: found 0.237, expected 0.23 +/- 0.02\n"
+    checks.check("steps", 1234.5, 1200, 50)
+    assert capsys.readouterr().out == "OK  steps: found 1234, expected 1200 +/- 50\n"
+
+
+def test_the_comparison_of_outputs_passes_over_what_was_found(capsys):
+    rules = configparser.ConfigParser(interpolation=None)
+    rules.read(Path(__file__).with_name("sanitize.cfg"))
+    rule = rules["the value that a check found"]
+    for found in (0.2371, 0.2412):
+        checks.check("mismatch rate", found, 0.23, 0.02)
+    checks.check("mismatch rate", 0.2371, 0.23, 0.03)
+    one, other, stricter = (
+        re.sub(rule["regex"], rule["replace"], line) for line in capsys.readouterr().out.splitlines()
+    )
+    assert one == other != stricter
 
 
 def test_check_prints_no_tolerance_where_there_is_none(capsys):
@@ -27,7 +43,9 @@ def test_check_prints_no_tolerance_where_there_is_none(capsys):
 
 def test_check_takes_arrays(capsys):
     checks.check("weights", np.array([0.1, 0.9]), [0.1, 0.9], 1e-6)
-    assert capsys.readouterr().out == "OK  weights = [0.1, 0.9] +/- 1e-06\n"
+    assert capsys.readouterr().out == (
+        "OK  weights: found [0.1000000, 0.9000000], expected [0.1, 0.9] +/- 1e-06\n"
+    )
     checks.check("all equal", np.array([2.0, 2.01]), 2, 0.02)
 
 
@@ -48,8 +66,8 @@ def test_an_array_does_not_broadcast_against_what_is_expected():
 
 
 def test_check_at_most(capsys):
-    checks.check_at_most("cost", 30.0, 30)
-    assert capsys.readouterr().out == "OK  cost <= 30\n"
+    checks.check_at_most("cost", 28.4, 30)
+    assert capsys.readouterr().out == "OK  cost: found 28, expected at most 30\n"
     for value in (30.1, np.nan):
         with pytest.raises(AssertionError, match="at most 30"):
             checks.check_at_most("cost", value, 30)
@@ -221,7 +239,7 @@ def test_a_placeholder_and_an_error_are_told(checker, capsys):
     assert "= thirty, expected" in capsys.readouterr().out
 
 
-# --- The symbol table of notebook 00 ---
+# --- The symbol table of notebook 0 ---
 
 
 def named(path):

@@ -1,4 +1,4 @@
-"""The checkers of notebooks 09 and 10: right answers pass, each likely mistake is told apart; the sliders."""
+"""The checkers of notebooks 13 and 14: right answers pass, each likely mistake is told apart; the sliders."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Notebook 04's figures, slider and exercises: do they show and say what is the case?"""
+"""Notebook 5's figures, slider and exercises: do they show and say what is the case?"""
 
 import itertools
 
@@ -68,7 +68,7 @@ def extremes(horizon, gamma, limit):
 def test_the_extremes(capsys):
     checks.check_extremes(extremes)
     assert capsys.readouterr().out == "OK  extremes is right in 4 cases\n"
-    assert extremes(301, 0.99, 50) == (18, 144)  # which notebook 04 says
+    assert extremes(301, 0.99, 50) == (18, 144)  # which notebook 5 says
 
 
 @pytest.mark.parametrize(

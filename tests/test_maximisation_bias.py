@@ -1,4 +1,4 @@
-"""Critics, bandits and general f of notebook 03, against closed forms, brute force and linear solves."""
+"""Critics, bandits and general f of notebook 3, against closed forms, brute force and linear solves."""
 
 import matplotlib
 import numpy as np

@@ -1,4 +1,4 @@
-"""What nbval cannot see: that it compares anything at all, and that a notebook stays short and clean.
+"""What nbval cannot see: that it compares anything at all, and that a notebook is complete and clean.
 
 nbval passes over a cell without an execution count even where it is marked, and a cell tagged
 raises-exception that raises nothing: both are ruled out here.
@@ -59,13 +59,6 @@ def test_stores_no_trace_of_the_machine(notebook):
     assert not [cell for cell in notebook.cells if "execution" in cell.metadata]
 
 
-def test_is_short(notebook):
-    lines = [len(cell.source.splitlines()) for cell in _code(notebook)]
-    words = sum(len(cell.source.split()) for cell in notebook.cells if cell.cell_type == "markdown")
-    assert len(lines) <= 25 and max(lines) <= 25 and sum(lines) <= 220
-    assert words <= 1500
-
-
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_is_small(path):
     assert path.stat().st_size < 500_000
@@ -83,7 +76,7 @@ def test_links_to_files_lead_somewhere(notebook):
 
 
 def test_the_symbols_are_names_of_the_library():
-    """Every name in the second column of notebook 00's table of symbols exists where the table says."""
+    """Every name in the second column of notebook 0's table of symbols exists where the table says."""
     table = _read("00").cells[-1].source
     names = re.findall(
         r"`([a-z_]+(?:\.\w+)+)`", "".join(line for line in table.splitlines() if line[:1] == "|")
@@ -96,14 +89,14 @@ def test_the_symbols_are_names_of_the_library():
 
 
 def test_the_results_show_a_new_algorithm(monkeypatch):
-    """Notebook 10 as it is shows an algorithm that is added to the registry, run or not."""
+    """Notebook 14 as it is shows an algorithm that is added to the registry, run or not."""
     rows = results.load_results("table1")
     both = pd.concat([rows, rows[rows["algorithm"] == "BC-All"].assign(algorithm="Run")])
     monkeypatch.setattr(results, "load_results", lambda name: both)
     monkeypatch.setattr(report, "load_results", lambda name: both)
     monkeypatch.setitem(ALGORITHMS, "Later", type("Later", (ALGORITHMS["BC-All"],), {"name": "Later"}))
     names, tables, pictures = {}, [], []
-    for cell in _code(_read("10")):
+    for cell in _code(_read("14")):
         if "import" in cell.source:
             exec(cell.source, names)
         elif cell.source.startswith(("Markdown(report.baselines_table", "Markdown(report.markdown(kept(")):
@@ -118,5 +111,5 @@ def test_the_results_show_a_new_algorithm(monkeypatch):
 
 
 def test_the_code_of_the_results_names_no_algorithm_but_c2iql():
-    code = "\n".join(cell.source for cell in _code(_read("10")))
+    code = "\n".join(cell.source for cell in _code(_read("14")))
     assert set(re.findall("|".join(f'"{re.escape(name)}"' for name in ALGORITHMS), code)) == {'"C2IQL"'}

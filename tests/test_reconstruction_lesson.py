@@ -1,4 +1,4 @@
-"""Notebook 05's figures, slider and exercises: do they show and say what is the case?"""
+"""Notebook 6's figures, slider and exercises: do they show and say what is the case?"""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""The agents of notebook 07: one policy per threshold on the repeated shortcut, and the budget rule (eq. 23).
+"""The agents of notebook 9: one policy per threshold on the repeated shortcut, and the budget rule (eq. 23).
 
 All results are exact. The probabilities of all states and spent costs are computed for every step, and
 nothing is sampled.

@@ -78,7 +78,7 @@ def shortcut_slider(limit: float = 1.0) -> Controls:
 
 
 def spend(config: ConditioningConfig, limit: float, bias: float = 1.0) -> Figure:
-    """Draws what notebook 07's agent does under a limit: the thresholds given, its cost and its return."""
+    """Draws what notebook 9's agent does under a limit: the thresholds given, its cost and its return."""
     told = laps.told(config, limit)
     found = laps.follow_rule(config, laps.policies(np.unique(told), bias), limit)
     title = f"limit {limit:g}, bias {bias:g}: expected cost {found.cost:.1f}, return {found.reward:.2f}"

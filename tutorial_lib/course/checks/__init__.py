@@ -1,10 +1,10 @@
 """This package holds the checks of the notebooks' claims and the checkers of their exercises.
 
-There is one file for each notebook; notebooks 09 and 10 share `studies.py`, and all share `checker.py`.
+There is one file for each notebook; notebooks 13 and 14 share `studies.py`, and all share `checker.py`.
 
-A check prints one line where the claim is true. The line does not show the computed value, so a notebook has
-the same outputs on every machine. A check raises AssertionError with the computed value where the claim is
-false. The checker of an exercise does not raise errors. It prints OK or the first mistake.
+A check prints one line where the claim is true: what was found, rounded, and what was expected. The comparison
+of a notebook's outputs passes over what was found, because it differs a little between machines. A check
+raises AssertionError where the claim is false. The checker of an exercise does not raise errors. It prints OK or the first mistake.
 """
 
 from tutorial_lib.course.checks.c2iql import *

@@ -1,4 +1,4 @@
-"""This module checks the answers to the exercises of notebook 08."""
+"""This module checks the answers to the exercises of notebook 11."""
 
 from collections.abc import Callable
 
@@ -8,7 +8,7 @@ from tutorial_lib.course.checks.checker import try_answer
 
 
 def check_implicit_cost_value(answer: Callable) -> None:
-    """Checks an exercise of notebook 08.
+    """Checks an exercise of notebook 11.
 
     `answer(q, v, q_cost, kappa)` returns V_c of one state, which is the cost under the implicit policy.
     """
@@ -42,7 +42,7 @@ def check_implicit_cost_value(answer: Callable) -> None:
 
 
 def check_condition(answer: Callable) -> None:
-    """Checks an exercise of notebook 08.
+    """Checks an exercise of notebook 11.
 
     `answer(limit, spent, t, horizon, thresholds)` returns the threshold that eq. 23 selects at step t.
     """

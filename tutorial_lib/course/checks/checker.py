@@ -1,5 +1,6 @@
 """This module checks the claims of the notebooks and holds the code that all exercise checkers use."""
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -10,10 +11,11 @@ from tutorial_lib.tasks import Task
 
 
 def check(name: str, value, expected, tolerance: float = 0.0) -> None:
-    """Checks that `value` differs from `expected` by at most `tolerance`.
+    """Checks that `value` differs from `expected` by at most `tolerance`, and prints both.
 
     Every element of an array must satisfy this. Two arrays must have the same shape. A scalar `expected` is
-    compared with every element of `value`. Raises AssertionError.
+    compared with every element of `value`. With a tolerance, the value that was found is printed with one
+    digit more than the tolerance has. Raises AssertionError.
     """
     value, expected = np.asarray(value, float), np.asarray(expected, float)
     if value.shape != expected.shape and expected.ndim:
@@ -21,14 +23,17 @@ def check(name: str, value, expected, tolerance: float = 0.0) -> None:
     close = np.abs(value - expected) <= tolerance  # a comparison with NaN is False
     if not np.all(close):
         raise AssertionError(f"FAILED  {name} = {text(value)}, expected {text(expected)} +/- {tolerance:g}")
-    print(f"OK  {name} = {text(expected)}" + (f" +/- {tolerance:g}" if tolerance else ""))
+    if not tolerance:
+        print(f"OK  {name} = {text(expected)}")
+        return
+    print(f"OK  {name}: found {_rounded(value, tolerance)}, expected {text(expected)} +/- {tolerance:g}")
 
 
 def check_at_most(name: str, value: float, bound: float) -> None:
-    """Checks that `value` is at most `bound`. Raises AssertionError."""
+    """Checks that `value` is at most `bound`, and prints both. Raises AssertionError."""
     if not value <= bound:
         raise AssertionError(f"FAILED  {name} = {text(value)}, expected at most {text(bound)}")
-    print(f"OK  {name} <= {text(bound)}")
+    print(f"OK  {name}: found {value:.2g}, expected at most {text(bound)}")
 
 
 def check_that(claim: str, holds) -> None:
@@ -52,6 +57,14 @@ def text(value) -> str:
         return "[" + ", ".join(text(element) for element in value) + "]"
     is_number = isinstance(value, int | float | np.number | np.ndarray) and not isinstance(value, bool)
     return f"{value:.5g}" if is_number else str(value)
+
+
+def _rounded(value: np.ndarray, tolerance: float) -> str:
+    """Returns the numbers of `value` with one digit more than `tolerance` has."""
+    if value.ndim:
+        return "[" + ", ".join(_rounded(element, tolerance) for element in value) + "]"
+    decimals = max(0, 1 - math.floor(math.log10(tolerance)))
+    return f"{value:.{decimals}f}"
 
 
 def try_answer(answer: Callable, cases) -> None:

@@ -1,4 +1,4 @@
-"""This module checks the answers to the exercises of notebook 01."""
+"""This module checks the answers to the exercises of notebook 1."""
 
 from collections.abc import Callable
 
@@ -9,7 +9,7 @@ from tutorial_lib.course.tabular import CMDP, least_cost, shortcut
 
 
 def check_run_cost(answer: Callable) -> None:
-    """Checks an exercise of notebook 01.
+    """Checks an exercise of notebook 1.
 
     `answer(y, speed, speed_limit)` returns the cost of a step in a Run task.
     """
@@ -28,7 +28,7 @@ def check_run_cost(answer: Callable) -> None:
 
 
 def check_least_cost(answer: Callable) -> None:
-    """Checks an exercise of notebook 01: `answer(cmdp)` returns the least discounted cost of all policies."""
+    """Checks an exercise of notebook 1: `answer(cmdp)` returns the least discounted cost of all policies."""
     stay, swap = np.eye(2), np.eye(2)[::-1]
     zeros, first = np.zeros((2, 2)), np.array([1.0, 0.0])
     one_state = CMDP(np.ones((1, 2, 1)), zeros[:1], np.array([[1.0, 0.25]]), np.ones(1), 0.9)

@@ -1,4 +1,4 @@
-"""This module checks the answers to the exercises of notebook 07."""
+"""This module checks the answers to the exercises of notebook 9."""
 
 from collections.abc import Callable
 
@@ -10,7 +10,7 @@ from tutorial_lib.course.tabular import budget_optimum, random_cmdp
 
 
 def check_rescaled_budget(answer: Callable) -> None:
-    """Checks an exercise of notebook 07: `answer(limit, spent, t, horizon)` returns the value of eq. 23."""
+    """Checks an exercise of notebook 9: `answer(limit, spent, t, horizon)` returns the value of eq. 23."""
     hints = {
         (30.0, 0.0, 0, 200): "at the start: the limit itself",
         (30.0, 15.0, 100, 200): "half spent at half time: on schedule, the limit itself",
@@ -23,7 +23,7 @@ def check_rescaled_budget(answer: Callable) -> None:
 
 
 def check_budget_backup(answer: Callable) -> None:
-    """Checks an exercise of notebook 07.
+    """Checks an exercise of notebook 9.
 
     `answer(cmdp, then)` computes one backward step of the budget recursion. `then` and the result have the
     shape (b+1, S), where b is the budget and S is the number of states.

@@ -1,4 +1,4 @@
-"""This module checks the answers to the exercises of notebook 04."""
+"""This module checks the answers to the exercises of notebook 5."""
 
 from collections.abc import Callable
 
@@ -9,7 +9,7 @@ from tutorial_lib.course.checks.checker import text, try_answer
 
 
 def check_false_positive(costs, gamma: float = 0.8, limit: float = 3, horizon: int = 10) -> None:
-    """Checks an exercise of notebook 04: whether an episode with these costs is safe but rejected.
+    """Checks an exercise of notebook 5: whether an episode with these costs is safe but rejected.
 
     `costs` holds a cost of 0 or 1 for each of the `horizon` steps.
     """
@@ -17,7 +17,7 @@ def check_false_positive(costs, gamma: float = 0.8, limit: float = 3, horizon: i
 
 
 def check_false_negative(costs, gamma: float = 0.8, limit: float = 3, horizon: int = 10) -> None:
-    """Checks an exercise of notebook 04: whether an episode with these costs is unsafe but accepted.
+    """Checks an exercise of notebook 5: whether an episode with these costs is unsafe but accepted.
 
     `costs` holds a cost of 0 or 1 for each of the `horizon` steps.
     """
@@ -65,7 +65,7 @@ def _not_a_sequence(costs, horizon) -> str:
 
 
 def check_extremes(answer: Callable) -> None:
-    """Checks an exercise of notebook 04.
+    """Checks an exercise of notebook 5.
 
     `answer(horizon, gamma, limit)` returns two numbers of unsafe steps: the smallest number that L~ can
     reject and the largest number that it can accept.

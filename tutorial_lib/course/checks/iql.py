@@ -1,4 +1,4 @@
-"""This module checks the answers to the exercises of notebook 03."""
+"""This module checks the answers to the exercises of notebook 3."""
 
 from collections.abc import Callable
 
@@ -8,7 +8,7 @@ from tutorial_lib.course.checks.checker import try_answer
 
 
 def check_expectile(answer: Callable) -> None:
-    """Checks an exercise of notebook 03.
+    """Checks an exercise of notebook 3.
 
     `answer(values, kappa)` returns the expectile of equally frequent values.
     """
@@ -27,7 +27,7 @@ def check_expectile(answer: Callable) -> None:
 
 
 def check_linex_weight(answer: Callable) -> None:
-    """Checks an exercise of notebook 03.
+    """Checks an exercise of notebook 3.
 
     `answer(u, a)` returns the weight |f'(u)| / |u| of f(u) = exp(a u) - a u. At u = 0 it returns the value
     that this ratio approaches.

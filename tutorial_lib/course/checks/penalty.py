@@ -1,4 +1,4 @@
-"""This module checks the answers to the exercises of notebook 06."""
+"""This module checks the answers to the exercises of notebook 8."""
 
 from collections.abc import Callable
 
@@ -22,7 +22,7 @@ class _Slope:
 
 
 def check_implicit_policy(answer: Callable) -> None:
-    """Checks an exercise of notebook 06.
+    """Checks an exercise of notebook 8.
 
     `answer(mu, q, v, slope)` returns the implicit policy of Theorem 1. `mu`, `q` and the result have the
     shape (..., A), where A is the number of actions. `v` has the shape (..., 1), or is a number.
@@ -52,7 +52,7 @@ def check_implicit_policy(answer: Callable) -> None:
 
 
 def check_batched_loss(answer: Callable) -> None:
-    """Checks an exercise of notebook 06.
+    """Checks an exercise of notebook 8.
 
     `answer(weight, q_cost, value)` returns the loss of eq. 17. The tensors have the shapes (B,), (B, 1) and
     (B,), where B is the number of transitions.

@@ -1,4 +1,4 @@
-"""This module checks the answers to the exercises of notebook 05."""
+"""This module checks the answers to the exercises of notebook 6."""
 
 from collections.abc import Callable
 
@@ -9,7 +9,7 @@ from tutorial_lib.tasks import TASKS
 
 
 def check_flat_weights(answer: Callable) -> None:
-    """Checks an exercise of notebook 05.
+    """Checks an exercise of notebook 6.
 
     `answer(gammas, horizon)` returns the weights w that minimise the sum over steps t of
     (sum over heads i of w_i gamma_i^t - 1)^2.
@@ -34,7 +34,7 @@ def check_flat_weights(answer: Callable) -> None:
 
 
 def check_error_in_cost(answer: Callable) -> None:
-    """Checks an exercise of notebook 05.
+    """Checks an exercise of notebook 6.
 
     `answer(weights, error)` returns three errors of the reconstructed cost, where every head has an error of
     size `error`: for independent errors, for errors with the worst signs, and for a common error.

@@ -1,4 +1,4 @@
-"""This module checks the answers to the exercises of notebook 02."""
+"""This module checks the answers to the exercises of notebook 2."""
 
 from collections.abc import Callable
 
@@ -8,7 +8,7 @@ from tutorial_lib.course.checks.checker import try_answer
 
 
 def check_episode_sums(answer: Callable) -> None:
-    """Checks an exercise of notebook 02.
+    """Checks an exercise of notebook 2.
 
     `answer(values, terminals, timeouts)` returns the undiscounted sum of each complete episode.
     """
@@ -27,7 +27,7 @@ def check_episode_sums(answer: Callable) -> None:
 
 
 def check_backup_target(answer: Callable) -> None:
-    """Checks an exercise of notebook 02.
+    """Checks an exercise of notebook 2.
 
     `answer(reward, gamma, next_value, terminal, timeout, bootstrap)` returns the target of a backup.
     """

@@ -1,4 +1,4 @@
-"""This module checks the installation and the answers to the exercises of notebook 00."""
+"""This module checks the installation and the answers to the exercises of notebook 0."""
 
 import platform
 import sys
@@ -55,7 +55,7 @@ def _episode_repeats() -> bool:
 
 
 def check_keeps_limit(answer: Callable) -> None:
-    """Checks an exercise of notebook 00.
+    """Checks an exercise of notebook 0.
 
     `answer(costs, limit)` returns whether a policy with these episode costs keeps the limit of eq. 1.
     """
@@ -69,7 +69,7 @@ def check_keeps_limit(answer: Callable) -> None:
 
 
 def check_normalised_return(answer: Callable) -> None:
-    """Checks an exercise of notebook 00.
+    """Checks an exercise of notebook 0.
 
     `answer(total, task)` returns DSRL's normalised return. The task's record holds the reference returns.
     """

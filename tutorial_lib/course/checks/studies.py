@@ -1,4 +1,4 @@
-"""This module checks the answers to the exercises of notebooks 09 and 10."""
+"""This module checks the answers to the exercises of notebooks 13 and 14."""
 
 from collections.abc import Callable
 
@@ -10,7 +10,7 @@ from tutorial_lib.course.checks.checker import try_answer
 
 
 def check_paired_interval(answer: Callable) -> None:
-    """Checks an exercise of notebook 09.
+    """Checks an exercise of notebook 13.
 
     `answer(first, second)` returns the 95% interval (low, high) of the mean paired difference.
     """
@@ -32,7 +32,7 @@ def check_paired_interval(answer: Callable) -> None:
 
 
 def check_best_safe(answer: Callable) -> None:
-    """Checks an exercise of notebook 09.
+    """Checks an exercise of notebook 13.
 
     `answer(rewards, costs)` returns the index of the setting that has the highest reward among those with a
     cost of at most 1. It returns -1 where no setting has such a cost.
@@ -50,7 +50,7 @@ def check_best_safe(answer: Callable) -> None:
 
 
 def check_seed_spread(answer: Callable) -> None:
-    """Checks an exercise of notebook 10.
+    """Checks an exercise of notebook 14.
 
     `answer(scores)` returns the standard deviation over seeds. The score of a seed is the mean over its
     episodes at each limit, then the mean over the limits.
@@ -81,7 +81,7 @@ def check_seed_spread(answer: Callable) -> None:
 
 
 def check_share_kept(answer: Callable) -> None:
-    """Checks an exercise of notebook 10.
+    """Checks an exercise of notebook 14.
 
     `answer(costs, limits)` returns the share of mean costs that are at most their limit. `costs` has one row
     for each agent and one column for each limit.

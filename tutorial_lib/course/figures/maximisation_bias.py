@@ -1,4 +1,4 @@
-"""The figures of notebook 03: the bias of a maximum, expectiles, and implicit policies."""
+"""The figures of notebook 3: the bias of a maximum, expectiles, and implicit policies."""
 
 import numpy as np
 from matplotlib import ticker

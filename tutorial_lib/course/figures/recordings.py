@@ -1,4 +1,4 @@
-"""The figures of notebook 02: the recordings, before any training."""
+"""The figures of notebook 2: the recordings, before any training."""
 
 import numpy as np
 from matplotlib.colors import LogNorm
