@@ -111,19 +111,20 @@ class Slow:
     def cost(self, heads):
         """What is compared with the limit: a whole episode's cost, from one critic's heads."""
         config = self.agent.config
-        gammas = TASK.gammas if self.name in ("C2IQL", "C2IQL w/o CC") else [config.gamma]
-        if config.time_limits == "rate":
-            heads = [q * (1 - g**T) for q, g in zip(heads, gammas, strict=True)]
-        if len(gammas) > 1:
+        if self.name in ("C2IQL", "C2IQL w/o CC"):
+            if config.time_limits == "rate":
+                heads = [q * (1 - g**T) for q, g in zip(heads, TASK.gammas, strict=True)]
             return self.agent.reconstruction(torch.tensor([heads])).item()
-        steady = sum(config.gamma**t for t in range(T)) / T  # discounted sum of one unit of cost in T steps
-        return heads[0] / steady
+        # Q_c <= L~ (eq. 2), where L~ is the discounted sum of a cost of L / T in each of T steps.
+        return heads[0] / (sum(config.gamma**t for t in range(T)) / T)
 
     def cost_of(self, x, s, a, s_next):
-        """The heads that line 17 asks for, those of the worst critic, and the episode's cost that counts."""
+        """The heads that line 17 asks for, those that V_c learns, and the episode's cost that counts."""
         config = self.agent.config
         critics = [k[0] for k in self.call("target", "cost_critics", s, a)]
         cost, q_cost = max((self.cost(heads), heads) for heads in critics)
+        if config.evaluated_critic == "mean":
+            q_cost = [sum(heads) / len(critics) for heads in zip(*critics, strict=True)]
         stops = x.terminals or (config.time_limits == "mask" and x.timeouts)
         after = self.call("online", "cost_value", s_next)[0]
         gammas = TASK.gammas if len(after) > 1 else [config.gamma]
@@ -148,6 +149,16 @@ class Slow:
             -0.5 * ((x - m) / math.exp(z)) ** 2 - z - 0.5 * math.log(2 * math.pi)
             for x, m, z in zip(a, mean, log_std, strict=True)
         )
+
+    def evaluation_error(self, k, x, s, a, s_next):
+        """By how much evaluator k errs about the rest of the episode, in cost ranges."""
+
+        def rest(kind, inputs, action, t):
+            return self.call(kind, "evaluators", inputs, action)[k][0] * (T - t) * TASK.max_step_cost
+
+        after = rest("target", s_next, self.call("online", "policy", s_next)[0], x.timesteps + 1)
+        target = x.costs if x.terminals or x.timeouts else x.costs + after
+        return (target - rest("online", s, a, x.timesteps)) / TASK.cost_range
 
     def losses(self, batch):
         config, sums = self.agent.config, {}
@@ -193,6 +204,8 @@ class Slow:
             else:
                 w = min(100.0, math.exp(config.awr_alpha * u * 1000 / (TASK.max_return - TASK.min_return)))
             add("policy_loss", -w * self.log_prob(s, a))
+            for k in range(getattr(config, "evaluators", 0)):
+                add("evaluators_loss", self.evaluation_error(k, x, s, a, s_next) ** 2)
         if getattr(config, "price_unit", "") == "advantage" and config.unsafe_price is not None:
             spreads = np.std(self.untouched, axis=0) if self.untouched else (0.0, 0.0)
             sums |= dict(zip(("reward_spread", "cost_spread"), spreads, strict=True))
@@ -211,8 +224,11 @@ VARIANTS = [
     {"unsafe_price": 0.5, "price_unit": "advantage"},
     {"clock": True, "time_limits": "mask"},
     {"clock": True, "time_limits": "mask", "unsafe_price": 0.5, "price_unit": "advantage"},
+    {"clock": True, "time_limits": "mask", "evaluators": 1},
+    {"clock": True, "time_limits": "mask", "evaluators": 2, "evaluated_critic": "mean"},
     {"cost_critics": 1},
     {"cost_critics": 3},
+    {"cost_critics": 3, "evaluated_critic": "mean"},
     {"kappa_1": 0.5, "kappa_2": 0.6, "gamma": 0.7},
     {"kappa_1": 0.5, "gamma": 0.7, "awr_alpha": 0.03},
 ]
@@ -403,6 +419,44 @@ def test_the_exchange_rate_follows_the_ratio_of_the_spreads():
 def test_a_clock_needs_limits_on_the_remaining_cost():
     with pytest.raises(ValueError, match="clock=True needs time_limits='mask'"):
         make_agent("C2IQL", clock=True)
+
+
+def test_evaluators_need_a_clock_and_the_rule_needs_evaluators():
+    with pytest.raises(ValueError, match="need clock=True"):
+        make_agent("C2IQL", evaluators=1)
+    with pytest.raises(ValueError, match="needs evaluators: set evaluators=1"):
+        make_agent("C2IQL", tell="predicted")
+
+
+def told_by_hand(agent, observation, left, t):
+    """The largest limit whose predicted rest of the episode fits what is left, tried one by one."""
+    slow, fitting = Slow(agent), [0.0]
+    for limit in [n / 40 * TASK.cost_range for n in range(41)] + [math.inf]:
+        s = slow.inputs(observation, limit, t)
+        action = slow.call("online", "policy", s)[0]
+        shares = [k[0] for k in slow.call("online", "evaluators", s, action)]
+        if max(shares) * (T - t) * TASK.max_step_cost <= left:
+            fitting.append(limit)
+    return fitting[-1]
+
+
+def test_the_largest_limit_is_told_whose_predicted_cost_fits_what_is_left():
+    options = {"clock": True, "time_limits": "mask", "evaluators": 2, "tell": "predicted"}
+    agent = make_agent("C2IQL", **options)
+    randomise(agent, 3)
+    observations = np.random.default_rng(0).normal(size=(30, TASK.obs_dim)).astype(np.float32)
+    limits = np.linspace(0, 1.2 * T * TASK.max_step_cost, 30)
+    player = agent.player(limits, range(30))
+    costs = np.ones(30)
+    for t in range(3):
+        actions, told = player.act(observations), player.told
+        expected = [
+            told_by_hand(agent, *pair, t) for pair in zip(observations, limits - t * costs, strict=True)
+        ]
+        np.testing.assert_allclose(told, expected)
+        assert actions == pytest.approx(agent.act(observations, told, 0, t))
+        player.see(np.zeros(30), costs)
+    assert told[0] == 0 and told[-1] == math.inf and len(set(told)) > 3
 
 
 @pytest.mark.parametrize("name", CONDITIONED)

@@ -55,7 +55,8 @@ def rollout(
     lengths, alive = np.full(count, task.horizon), np.ones(count, bool)
     predicted = player.predicted_cost(observations)
     for t in range(task.horizon):
-        told[t], actions = player.told, player.act(observations)
+        actions = player.act(observations)
+        told[t] = player.told
         for e in np.flatnonzero(alive):
             observations[e], rewards[t, e], terminated, _, info = envs[e].step(actions[e])
             costs[t, e] = info["cost"]

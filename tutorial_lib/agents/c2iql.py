@@ -35,18 +35,25 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from tutorial_lib import losses
+from tutorial_lib.agents.evaluation import (
+    EvaluationConfig,
+    Evaluators,
+    evaluation_loss,
+    largest_that_fits,
+    limits_to_tell,
+    most_cost,
+)
 from tutorial_lib.agents.implicit import ConstrainedAgent, ConstrainedConfig
-from tutorial_lib.agents.player import CountingPlayer, Player
+from tutorial_lib.agents.player import BudgetPlayer, Player
 from tutorial_lib.agents.seeds import Fields, Networks
 from tutorial_lib.costs.conditioning import (
     ConditioningConfig,
     after_step,
     draw_thresholds,
     encode,
-    told_limit,
 )
 from tutorial_lib.costs.discounting import average_threshold
 from tutorial_lib.costs.reconstruction import (
@@ -61,7 +68,7 @@ from tutorial_lib.tasks import Task
 
 
 @dataclass(frozen=True)
-class C2IQLConfig(ConstrainedConfig, ReconstructionConfig, ConditioningConfig):
+class C2IQLConfig(ConstrainedConfig, ReconstructionConfig, ConditioningConfig, EvaluationConfig):
     """The options of C2IQL: those of CIQL, of the reconstruction model and of constraint conditioning."""
 
     # "Measured", at the top of this file, has the reasons.
@@ -74,29 +81,13 @@ class C2IQLConfig(ConstrainedConfig, ReconstructionConfig, ConditioningConfig):
 
 
 @dataclass(frozen=True)
-class WithoutCRConfig(ConstrainedConfig, ConditioningConfig):
+class WithoutCRConfig(ConstrainedConfig, ConditioningConfig, EvaluationConfig):
     """The options of C2IQL without cost reconstruction."""
 
 
 @dataclass(frozen=True)
 class WithoutCCConfig(ConstrainedConfig, ReconstructionConfig):
     """The options of C2IQL without constraint conditioning."""
-
-
-class BudgetPlayer(CountingPlayer):
-    """A player that tells the policy at every step what is left of the limit (eq. 23)."""
-
-    agent: "C2IQL"
-
-    @property
-    def told(self) -> np.ndarray:
-        """The limit that the policy is told at this step, (E,)."""
-        config = self.agent.config
-        remaining = config.time_limits == "mask"  # the critics then predict the remaining cost
-        return told_limit(self.agent.task, config, self.limits, self.spent, self.t, remaining)
-
-    def predicted_cost(self, observations: np.ndarray) -> np.ndarray:
-        return self.agent.predicted_cost(observations, self.told, self.run, self.t)
 
 
 class C2IQL(ConstrainedAgent):
@@ -108,7 +99,7 @@ class C2IQL(ConstrainedAgent):
     scalars = ConstrainedAgent.scalars | {
         "cost_mean": "mean expected cost of an episode, in unsafe steps: what line 9 compares with the limit",
     }
-    at_test: ClassVar[tuple[str, ...]] = ("infinite_at_test",)
+    at_test: ClassVar[tuple[str, ...]] = ("infinite_at_test", "tell")
     conditioned = True
     """True if the limit is an input of every network."""
     reconstructs = True
@@ -118,6 +109,10 @@ class C2IQL(ConstrainedAgent):
         super().__init__(task, config, *args, **kwargs)
         if self.clock and config.time_limits != "mask":
             raise ValueError("clock=True needs time_limits='mask': its limits are on the remaining cost")
+        if self.evaluates and not self.clock:
+            raise ValueError("evaluators need clock=True: they predict the remaining cost")
+        if not self.evaluates and self.conditioned and config.tell == "predicted":
+            raise ValueError("tell='predicted' needs evaluators: set evaluators=1")
         self.gammas = torch.tensor(self.cost_gammas, device=self.device)  # (m,)
         if self.reconstructs:  # untrained until `prepare` or `load_state`
             with torch.random.fork_rng(devices=[]):
@@ -133,8 +128,24 @@ class C2IQL(ConstrainedAgent):
         return self.conditioned and self.config.clock
 
     @property
+    def evaluates(self) -> bool:
+        """True if there are evaluators, which learn what the policy that acts will pay."""
+        return self.conditioned and self.config.evaluators > 0
+
+    @property
     def extra_inputs(self) -> int:
         return int(self.conditioned) + int(self.clock)
+
+    def build(self) -> dict[str, nn.Module | Tensor]:
+        built = super().build()
+        if self.evaluates:
+            inputs = self.task.obs_dim + self.extra_inputs
+            built["evaluators"] = Evaluators(inputs, self.task.act_dim, self.config)
+        return built
+
+    @property
+    def targets(self) -> tuple[str, ...]:  # type: ignore[override]
+        return (*ConstrainedAgent.targets, *(("evaluators",) if self.evaluates else ()))
 
     def prepare(self, datasets: Sequence[Dataset], progress: bool = True) -> None:
         """Trains the reconstruction model, then does what CIQL does before the first update."""
@@ -181,11 +192,11 @@ class C2IQL(ConstrainedAgent):
         It is in unsafe steps per episode.
         """
         horizon, gammas = self.task.horizon, self.gammas
+        if not self.reconstructs:
+            return q_cost.squeeze(-1) / average_threshold(1.0, self.config.gamma, horizon)  # L~ / L (eq. 2)
         if self.config.time_limits == "rate":  # the sum has no end: keep the share of the first T steps
             q_cost = q_cost * (1 - gammas**horizon)
-        if self.reconstructs:
-            return self.reconstruction(q_cost)
-        return q_cost.squeeze(-1) / average_threshold(1.0, self.config.gamma, horizon)  # L~ / L (eq. 2)
+        return self.reconstruction(q_cost)
 
     def losses(self, net: Networks, batch: Fields) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
         config, a, limit = self.config, batch.actions, batch.limit
@@ -194,7 +205,10 @@ class C2IQL(ConstrainedAgent):
         # Lines 6-8: cost reconstruction. The critic that predicts the highest cost counts.
         q_cost = net.target_cost_critics(s, a)  # (k, B, m)
         cost, worst = self.episode_cost(q_cost).max(0)  # (B,)
-        q_cost = q_cost.take_along_dim(worst[None, :, None], 0).squeeze(0)  # (B, m)
+        if config.evaluated_critic == "highest":
+            q_cost = q_cost.take_along_dim(worst[None, :, None], 0).squeeze(0)  # (B, m)
+        else:
+            q_cost = q_cost.mean(0)
 
         # Line 18: its target, which is needed here, too: it is the cost of the recorded step.
         # Eq. 16 prints V_c(s), but V_c(s') is meant.
@@ -229,6 +243,8 @@ class C2IQL(ConstrainedAgent):
 
         of_networks = {"value": value_loss, "cost_value": cost_value_loss, "critic": critic_loss}
         of_networks |= {"cost_critic": cost_critic_loss, "policy": policy_loss}
+        if self.evaluates:
+            of_networks["evaluators"] = evaluation_loss(net, batch, s, s_next, self.task)
         scalars = self.logged(cost, limit, v, q_reward, v_cost) | {"cost_mean": cost.mean()}
         return of_networks, scalars
 
@@ -246,13 +262,28 @@ class C2IQL(ConstrainedAgent):
     ) -> np.ndarray:
         """Returns the cost of an episode, (E,), that the highest cost critic predicts for the mean action.
 
-        It is in unsafe steps per episode. The observations of step t are (E, obs) and the limits are (E,).
+        It is in unsafe steps. With evaluators, they predict it, and not the cost critics. The observations of
+        step t are (E, obs) and the limits are (E,).
         """
         with torch.no_grad():
             net, x = self.networks(run), (self._tensor(observations), self._tensor(limits))
             s = self.network_input(net, *x, t)
             action, _ = net.policy(s)
-            return self.episode_cost(net.cost_critics(s, action)).amax(0).cpu().numpy()
+            if self.evaluates:
+                costs = net.evaluators(s, action) * most_cost(self.task, t)
+            else:
+                costs = self.episode_cost(net.cost_critics(s, action))
+            return costs.amax(0).cpu().numpy()
+
+    def largest_limit(self, observations: np.ndarray, left: np.ndarray, run: int, t: int) -> np.ndarray:
+        """Returns the largest limit, (E,), whose predicted cost is at most `left` (E,), or zero if none is.
+
+        The observations of step t are (E, obs).
+        """
+        choices = limits_to_tell(self.task)
+        pairs = np.repeat(observations, len(choices), 0), np.tile(choices, len(observations))
+        costs = self.predicted_cost(*pairs, run, t).reshape(len(observations), len(choices))
+        return largest_that_fits(choices, costs, left)
 
     def diagnose(self, dataset: Dataset) -> dict[str, float]:
         """Returns the error of the reconstruction model, in unsafe steps per episode."""

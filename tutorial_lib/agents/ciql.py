@@ -8,8 +8,8 @@ Departures:
 2. In profile `small`, the value of an unsafe action is Q_r minus a price of its cost beyond the limit. In eq.
    11 and in profile `paper` it is zero (`unsafe_price`).
 3. In profile `small`, the cost of a recorded action is at least that of its recorded step (`recorded_step`).
-4. The cost critics bootstrap through time limits, and their values are multiplied by 1 - gamma^T
-   (`time_limits`). The paper does not say what a time limit means.
+4. The cost critics bootstrap through time limits (`time_limits`). The paper does not say what a time limit
+   means.
 5. There are two cost critics, and the higher cost counts (`cost_critics`). The paper does not say how many it
    has.
 
@@ -39,10 +39,7 @@ class CIQL(ConstrainedAgent):
 
         To compare them with L is to compare Q_c with L~.
         """
-        gamma, horizon = self.config.gamma, self.task.horizon
-        if self.config.time_limits == "rate":  # the sum has no end: keep the share of the first T steps
-            q_cost = q_cost * (1 - gamma**horizon)
-        return q_cost.squeeze(-1) / average_threshold(1.0, gamma, horizon)
+        return q_cost.squeeze(-1) / average_threshold(1.0, self.config.gamma, self.task.horizon)
 
     def losses(self, net: Networks, batch: Fields) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
         config, a, limit = self.config, batch.actions, batch.limit
@@ -50,8 +47,9 @@ class CIQL(ConstrainedAgent):
         s_next = self.network_input(net, batch.next_observations, limit)
 
         # The cost of an action: the highest of the cost critics, and at least the recorded step (eq. 16).
-        q_cost = net.target_cost_critics(s, a).amax(0)  # (B, 1)
-        cost = self.episode_cost(q_cost)
+        q_cost = net.target_cost_critics(s, a)  # (k, B, 1)
+        cost = self.episode_cost(q_cost).amax(0)  # (B,)
+        q_cost = q_cost.amax(0) if config.evaluated_critic == "highest" else q_cost.mean(0)  # (B, 1)
         mask = self.cost_mask(batch)[:, None]
         cost_target = losses.td_target(batch.costs[:, None], config.gamma, net.cost_value(s_next), mask)
         if config.recorded_step:

@@ -38,15 +38,19 @@ class ConstrainedConfig(ImplicitConfig):
     """The expectile of the policy extraction (Table 4), a temperature between cloning and maximising."""
     time_limits: Literal["rate", "bootstrap", "mask"] = "rate"
     """What a time limit means to the cost critics. The paper does not say. With 'rate', their targets
-    bootstrap through it, and head i is multiplied by 1 - gamma_i^T before the cost is compared with the
-    limit. With 'bootstrap', there is no such factor. With 'mask', nothing follows a time limit. The critics
-    then predict the remaining cost, which is compared with the remaining budget without rescaling."""
+    bootstrap through it, and head i is multiplied by 1 - gamma_i^T before the reconstruction. With
+    'bootstrap', or without a reconstruction, there is no such factor. With 'mask', nothing follows a time
+    limit. The critics then predict the remaining cost, which is compared with the remaining budget without
+    rescaling."""
     cost_kappa: Annotated[float | None, SHARE] = None
     """The expectile of the implicit policy whose cost the cost critics learn. None means kappa_1, as in
     Algorithm 2. The policy that acts is extracted with kappa_2, so with the value of kappa_2 here the cost
     critics learn (nearly) the cost of the policy that acts."""
     cost_critics: Annotated[int, COUNT] = 2
     """The number of cost critics, of which the highest cost counts. The paper does not give it."""
+    evaluated_critic: Literal["highest", "mean"] = "highest"
+    """What V_c learns from, if there are several cost critics: the one that predicts the highest cost, or the
+    mean of all. With 'highest', every backup takes a maximum again, so errors only add up."""
     unsafe_price: Annotated[float | None, NOT_NEGATIVE] = None
     """The price of cost beyond the limit, in units of `price_unit`. None means that an unsafe action has the
     value zero, as in eq. 11. With a number, its value is Q_r minus the price of every unit of cost beyond the

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from tutorial_lib.costs.conditioning import told_limit
+
 if TYPE_CHECKING:
     from tutorial_lib.agents.agent import Agent
 
@@ -65,3 +67,33 @@ class CountingPlayer(Player):
     def see(self, rewards: np.ndarray, costs: np.ndarray) -> None:
         """Counts the costs (E,) of the step."""
         self.spent, self.t = self.spent + costs, self.t + 1
+
+
+class BudgetPlayer(CountingPlayer):
+    """A player that tells the policy at every step what is left of the limit (eq. 23)."""
+
+    @property
+    def left(self) -> np.ndarray:
+        """What is left of the limit at this step, as eq. 23 tells it to the policy, (E,)."""
+        config = self.agent.config
+        remaining = config.time_limits == "mask"  # the critics then predict the remaining cost
+        return told_limit(self.agent.task, config, self.limits, self.spent, self.t, remaining)
+
+    def _choose(self, observations: np.ndarray) -> np.ndarray:
+        """Sets and returns the limits that the policy is told at observations (E, obs), (E,)."""
+        self._told = self.left
+        if self.agent.config.tell == "predicted":
+            left = self.limits - self.spent
+            self._told = self.agent.largest_limit(observations, left, self.run, self.t)
+        return self._told
+
+    def act(self, observations: np.ndarray) -> np.ndarray:
+        return self.agent.act(observations, self._choose(observations), self.run, self.t)
+
+    @property
+    def told(self) -> np.ndarray:
+        """The limit that the policy is told at this step, (E,). With tell='predicted', `act` chooses it."""
+        return self._told if self.agent.config.tell == "predicted" else self.left
+
+    def predicted_cost(self, observations: np.ndarray) -> np.ndarray:
+        return self.agent.predicted_cost(observations, self._choose(observations), self.run, self.t)
