@@ -25,7 +25,7 @@ METRICS = "metrics.csv"
 """The file of a run's folder with the log of its training."""
 NEWER_OPTIONS: dict[str, Any] = {
     "thresholds": "set", "infinite_share": 0.15, "zero_share": 0.1, "episode_share": 0.5,
-    "clock": False, "price_unit": "return",
+    "clock": False, "price_unit": "return", "evaluated_critic": "highest", "evaluators": 0, "tell": "left",
 }  # fmt: skip
 """The options that the shipped agents' files do not name yet, and what these agents were trained with."""
 LARGEST_OPTION = 100_000_000

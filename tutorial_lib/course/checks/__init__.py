@@ -2,9 +2,10 @@
 
 There is one file for each notebook; notebooks 13 and 14 share `studies.py`, and all share `checker.py`.
 
-A check prints one line where the claim is true: what was found, rounded, and what was expected. The comparison
-of a notebook's outputs passes over what was found, because it differs a little between machines. A check
-raises AssertionError where the claim is false. The checker of an exercise does not raise errors. It prints OK or the first mistake.
+A check prints one line where the claim is true: what was found, rounded, and what was expected. The
+comparison of a notebook's outputs passes over what was found, because it differs a little between machines.
+A check raises AssertionError where the claim is false. The checker of an exercise does not raise errors. It
+prints OK or the first mistake.
 """
 
 from tutorial_lib.course.checks.c2iql import *
