@@ -49,8 +49,10 @@ def test_each_source_is_its_own_and_shipped_is_the_default(places, dataset, tmp_
     write_dataset(shipped / "CarRun.hdf5", dataset.select([0]), "CarRun")
     write_dataset(dsrl / "SafetyCarRun-v0-40-651.hdf5", dataset.select([0, 1]), "CarRun")
     elsewhere = write_dataset(tmp_path / "mine.hdf5", dataset.select([0, 1, 2]), "CarRun")
+    folder = write_dataset(tmp_path / "more" / "CarRun.hdf5", dataset.select([0, 1, 2, 3]), "CarRun").parent
     load = lambda *source: sources.load_dataset("CarRun", *source).num_episodes  # noqa: E731
     assert [load(), load("shipped"), load("dsrl"), load(elsewhere), load(str(elsewhere))] == [1, 1, 2, 3, 3]
+    assert [load(folder), load(str(folder))] == [4, 4]
 
 
 def test_no_source_stands_in_for_another(places, dataset, tmp_path):

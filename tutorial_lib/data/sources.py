@@ -72,7 +72,8 @@ def _sha256(file: Path) -> str:
 def find_dataset(task: Task | str, source: Path | str = "shipped") -> Path:
     """The path of a task's dataset.
 
-    `source` is "shipped" for the file in this project, "dsrl" for DSRL's own file, or a path. Where the file
+    `source` is "shipped" for the file in this project, "dsrl" for DSRL's own file, or the path of a file, or
+    of a folder with a file TASK.hdf5 (so a study can read the datasets of all its tasks there). Where the file
     is missing, no other source is tried: otherwise the same command could use different data on two machines.
     Raises DatasetError, which says where the file was expected and which command makes or downloads it.
     """
@@ -90,6 +91,8 @@ def find_dataset(task: Task | str, source: Path | str = "shipped") -> Path:
         path = Path(source)
         with contextlib.suppress(RuntimeError):  # ~NAME where there is no such user
             path = path.expanduser()
+        if os.path.isdir(path):
+            path = path / f"{task.name}.hdf5"
         remedy = f"no such file: check the path, or use source 'shipped' or 'dsrl' ({fetch})"
     if not os.path.isfile(path):  # False also where the folder may not be looked into
         raise DatasetError(f"{path}: {remedy}")
