@@ -1,12 +1,15 @@
 """Sphinx's configuration of the site: the executed notebooks, and pages made from docstrings."""
 
+import hashlib
 import importlib
 import json
 import pkgutil
 import re
 import sys
+from binascii import a2b_base64
 from pathlib import Path
 
+from docutils import nodes
 from markdown_it import MarkdownIt
 from sphinx.application import Sphinx
 
@@ -20,19 +23,21 @@ project = "Safe offline reinforcement learning with C2IQL"
 html_title = project
 copyright = "2026, the C2IQL tutorial authors"
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.mathjax", "sphinx-mathjax-offline"]
-exclude_patterns = ["tutorial_lib", "benchmarks"]
+exclude_patterns = ["tutorial_lib", "benchmarks", "data/second"]
 
 nb_execution_mode = "off"  # the Makefile has executed the notebooks
 nb_output_stderr = "remove"
 nb_merge_streams = True
 nb_render_markdown_format = "myst"  # the default, plain CommonMark, has no tables
-nb_code_prompt_show = "Show a solution"  # only solutions are hidden
+nb_code_prompt_show = "Show a solution"  # only solutions are folded
 nb_code_prompt_hide = "Hide it"
 nb_ipywidgets_js = {}  # sliders need a running kernel, and their scripts need the network
 myst_enable_extensions = ["dollarmath", "amsmath"]
 myst_heading_anchors = 3  # pages have links to their own sections
 autodoc_member_order = "bysource"
 add_module_names = False  # the page's title has the module's name
+
+DESCRIPTIONS: dict[str, str] = {}  # of the images in notebooks: by the SHA-256 hash of a PNG file, its text
 
 html_theme = "furo"
 html_static_path = html_css_files = ["style.css"]
@@ -43,6 +48,7 @@ def setup(app: Sphinx) -> None:
     """Connect this file's functions to Sphinx's events."""
     app.connect("builder-inited", write_reference_pages)
     app.connect("source-read", finish_page)
+    app.connect("doctree-read", describe_images)
     app.connect("autodoc-process-docstring", read_docstring_as_markdown)
 
 
@@ -77,17 +83,32 @@ def finish_page(app: Sphinx, docname: str, source: list[str]) -> None:
     """Change the text of a page, `source[0]`, before Sphinx reads it.
 
     Notebooks lose the comments for machines. Their sliders lose the widgets' views, so that their text is
-    shown. The first page gets its table of contents.
+    shown. What their images show is kept for `describe_images`. The first page gets its table of contents.
     """
     if docname.startswith("notebooks/"):
         notebook = json.loads(source[0])
         remove_marks(notebook)
         for cell in notebook["cells"]:
             for output in cell.get("outputs", []):
-                output.get("data", {}).pop("application/vnd.jupyter.widget-view+json", None)
+                data = output.get("data", {})
+                data.pop("application/vnd.jupyter.widget-view+json", None)
+                if "image/png" in data:
+                    name = hashlib.sha256(a2b_base64("".join(data["image/png"]))).hexdigest()
+                    DESCRIPTIONS[name] = output["metadata"].get("image/png", {}).get("alt", "A figure.")
         source[0] = json.dumps(notebook)
     if docname == "index":
         source[0] = source[0].replace("CONTENTS", contents(Path(app.srcdir)))
+
+
+def describe_images(app: Sphinx, doctree: nodes.document) -> None:
+    """Give the images of a notebook the alternative texts that their outputs have in the notebook.
+
+    myst-nb leaves these texts out, and names each image's file after the image's hash.
+    """
+    for image in doctree.findall(nodes.image):
+        text = DESCRIPTIONS.get(Path(image["uri"]).stem)
+        if text:
+            image["alt"] = text
 
 
 def contents(folder: Path) -> str:

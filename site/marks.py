@@ -12,6 +12,11 @@ def is_solution(cell: dict) -> bool:
     return cell["cell_type"] == "code" and "".join(cell["source"]).startswith(SOLUTION + "\n")
 
 
+def is_answer(cell: dict) -> bool:
+    """Is this cell of a notebook the folded answer to a question or to an exercise without code?"""
+    return cell["cell_type"] == "markdown" and "answer" in cell["metadata"].get("tags", [])
+
+
 def remove_marks(notebook: Any) -> None:
     """Remove these comments from the code cells of a notebook (nbformat's object or plain JSON), in place."""
     for cell in notebook["cells"]:

@@ -1,95 +1,85 @@
-"""`python site/student.py FROM TO` writes the notebooks of folder FROM without their solutions to folder TO.
+"""`python site/student.py FROM TO` writes the notebooks of folder FROM for students to folder TO.
 
-The cells of solutions are removed. In the cell of an exercise, each `...` that a student must replace becomes
-a `raise` which says so. Code that needs an unsolved exercise then stops with the exercise's name, and the
-exercise's check reports it too. An exercise without a `...` is a faulty function to repair, and stays as it
-is.
+They have no outputs, no answers and no solutions. In the place of a solution stands a cell that says which
+part of its exercise is still to be written, and then goes on with the course's own (see exercises.py). So the
+notebook runs to its end whatever is still to be written. An exercise stays as it is.
 """
 
 import ast
+import json
+import shutil
 import sys
 from pathlib import Path
-from typing import Any
 
 import nbformat
-from marks import END_SOLUTION, is_solution, remove_marks
+from exercises import bindings, to_write
+from marks import END_SOLUTION, is_answer, is_solution, remove_marks
+from nbformat.v4 import new_code_cell
+
+HERE = Path(__file__).parent
+GO_ON = "from exercises import go_on\n\ngo_on({notebook!r}, {number})"
 
 
-def without_solutions(notebook: nbformat.NotebookNode) -> None:
-    """Remove the solutions from a notebook, and the outputs of their exercises, in place.
+def without_solutions(notebook: nbformat.NotebookNode, name: str) -> list[tuple[str, str]]:
+    """Makes a notebook the students' in place, and returns the code of its exercises and their solutions.
 
-    The exercise of a solution is the last code cell since the previous solution that has a `...`, or that
-    defines a function which the solution defines again. The outputs of all code cells from there to the
-    solution are removed. Raises ValueError for a solution without an end or an exercise.
+    `name` is the notebook's in exercises.json. The exercise of a solution is the last code cell since the
+    previous solution that leaves something to write. Raises ValueError for a solution without an end or an
+    exercise.
     """
-    since, kept = [], []
+    since, kept, pairs = [], [], []
     for cell in notebook.cells:
-        if is_solution(cell):
-            _open_exercise(since, cell)
-            since = []
+        if is_answer(cell):
             continue
-        kept.append(cell)
-        if cell.cell_type == "code":
+        if is_solution(cell):
+            exercise = _exercise(since, cell).source
+            pairs.append((exercise, _answer(exercise, cell.source)))
+            source = GO_ON.format(notebook=name, number=len(pairs))
+            cell = new_code_cell(source, id=cell.id, metadata={"jupyter": {"source_hidden": True}})
+            since = []
+        elif cell.cell_type == "code":
+            cell.outputs, cell.execution_count = [], None
             since.append(cell)
+        kept.append(cell)
     notebook.cells = kept
     remove_marks(notebook)
+    return pairs
 
 
-def _open_exercise(cells: list[nbformat.NotebookNode], solution: nbformat.NotebookNode) -> None:
-    """Prepare the exercise of a solution, which is one of the code cells before it. Raises ValueError."""
+def _exercise(cells: list[nbformat.NotebookNode], solution: nbformat.NotebookNode) -> nbformat.NotebookNode:
+    """Returns the exercise of a solution, which is one of the code cells before it. Raises ValueError."""
     if not solution.source.rstrip().endswith(END_SOLUTION):
         raise ValueError(f"no {END_SOLUTION!r} ends this cell:\n{solution.source}")
-    solved = _functions(solution.source)
-    found = [
-        n for n, cell in enumerate(cells) if _open_lines(cell.source) or _functions(cell.source) & solved
-    ]
-    if not found:
-        raise ValueError(f"no exercise precedes this solution:\n{solution.source}")
-    exercise = cells[found[-1]]
-    exercise.source = _raise_where_left_open(exercise.source)
-    for cell in cells[found[-1] :]:
-        cell.outputs, cell.execution_count = [], None
+    for cell in reversed(cells):
+        if to_write(cell.source, solution.source):
+            return cell
+    raise ValueError(f"no exercise precedes this solution:\n{solution.source}")
 
 
-def _functions(source: str) -> set[str]:
-    """The names of the functions that a cell defines."""
-    return {node.name for node in ast.parse(source).body if isinstance(node, ast.FunctionDef)}
+def _answer(exercise: str, solution: str) -> str:
+    """Returns the code of a solution that defines what the exercise asks for. Raises ValueError.
 
-
-def _open_lines(source: str) -> dict[int, tuple[int, str]]:
-    """The lines where `...` is a statement or an assigned value: {line: (indentation, its name)}."""
-    found = {}
-    for node in ast.walk(ast.parse(source)):
-        if isinstance(node, ast.FunctionDef):
-            for statement in node.body:
-                if _is_ellipsis(getattr(statement, "value", None)):
-                    found[statement.lineno] = (statement.col_offset, node.name)
-        elif isinstance(node, ast.Assign) and _is_ellipsis(node.value):
-            name = ast.unparse(node.targets[0])
-            found.setdefault(node.lineno, (node.col_offset, name))
-    return found
-
-
-def _is_ellipsis(value: Any) -> bool:
-    return isinstance(value, ast.Constant) and value.value is ...
-
-
-def _raise_where_left_open(source: str) -> str:
-    """The source of an exercise, with a `raise` in place of each `...`."""
-    lines = source.splitlines()
-    for number, (indentation, name) in _open_lines(source).items():
-        words = f'raise NotImplementedError("exercise: write {name} in place of this line")'
-        lines[number - 1] = " " * indentation + words
-    return "\n".join(lines)
+    The rest of the solution only checks or shows something.
+    """
+    body, last = ast.parse(solution).body, 0
+    for name in to_write(exercise, solution):
+        places = [n for n, node in enumerate(body) if name in bindings(ast.unparse(node))]
+        if not places:
+            raise ValueError(f"the exercise asks for {name}, which its solution does not define:\n{solution}")
+        last = max(last, places[-1])
+    return "\n".join(ast.unparse(node) for node in body[: last + 1] if not isinstance(node, ast.Expr))
 
 
 def main(source: Path, target: Path) -> None:
-    """Write all notebooks in `source` without their solutions to `target`."""
+    """Writes the students' notebooks of all notebooks in `source`, and what they need, to `target`."""
     target.mkdir(parents=True, exist_ok=True)
+    exercises = {}
     for path in sorted(source.glob("[0-9]*.ipynb")):
         notebook = nbformat.read(path, as_version=4)
-        without_solutions(notebook)
+        exercises[path.stem] = without_solutions(notebook, path.stem)
         nbformat.write(notebook, target / path.name)
+    (target / "exercises.json").write_text(json.dumps(exercises, indent=1), encoding="utf-8")
+    shutil.copyfile(HERE / "exercises.py", target / "exercises.py")
 
 
 if __name__ == "__main__":

@@ -302,3 +302,60 @@ def test_penalised_state_shows_a_mean_under_the_implicit_policy():
     assert "$V_c$ = 35.0" in everything.axes[2].get_title()
     with pytest.raises(ValueError, match="kappa"):
         figures.penalised_state(q, cost, [1 / 3] * 3, limit=1, kappa=1.0)
+
+
+def test_the_method_map_lights_the_parts_that_it_is_told():
+    """A lit box has a coloured edge; the limit stands on the map twice, and the robot is never lit."""
+    grey = figures.method_map().axes[0].patches
+    edges = {box.get_edgecolor() for box in grey}
+    assert len(grey) == 12 and len(edges) == 1
+    for part, boxes in {"limit": 2, "value": 2, "heads": 1, "budget": 1}.items():
+        lit = [box for box in figures.method_map(part).axes[0].patches if box.get_edgecolor() not in edges]
+        assert len(lit) == boxes, part
+    parts = "data critics value heads reconstruction penalty limit policy budget".split()
+    everything = figures.method_map(*parts).axes[0].patches
+    assert [box.get_edgecolor() in edges for box in everything] == [False] * 11 + [True]
+
+
+def test_the_method_map_says_in_words_what_is_lit():
+    assert figures.method_map("heads", "penalty").alt_text().endswith("Lit: heads, penalty.")
+    assert figures.method_map().alt_text().endswith("Lit: no part.")
+    with pytest.raises(ValueError, match=r"no part 'head'.*data, critics.*heads.*budget"):
+        figures.method_map("head")
+
+
+def test_no_letters_of_the_method_map_leave_their_box():
+    ax = figures.method_map("data").axes[0]
+    ax.figure.draw_without_rendering()
+    shapes = {tuple(box.get_window_extent().get_points().mean(0).round()): box for box in ax.patches}
+    inside = 0
+    for text in ax.texts:
+        here = text.get_window_extent()
+        for box in shapes.values():
+            frame = box.get_window_extent()
+            if frame.contains(*here.get_points().mean(0)):
+                inside += 1
+                assert frame.x0 < here.x0 and here.x1 < frame.x1, text.get_text()
+                assert frame.y0 < here.y0 and here.y1 < frame.y1, text.get_text()
+    assert inside == len(ax.patches)
+
+
+def test_a_figure_without_a_description_is_described_by_its_labels():
+    figure, axes = style.subplots(1, 2)
+    axes[0].plot([1], label="cost")
+    axes[0].set(title="Left", xlabel="step", ylabel="cost so far")
+    axes[1].set(xlabel="limit")
+    assert figure.alt_text() == "Figure. Left; cost so far over step; cost. limit."
+    assert style.described(figure, "A line\n  that rises.") is figure
+    assert figure.alt_text() == "A line that rises."
+    with pytest.raises(ValueError, match="empty"):
+        style.described(figure, " ")
+    plt.close(figure)
+
+
+def test_a_notebook_stores_what_a_figure_shows(monkeypatch):
+    shown = {}
+    monkeypatch.setattr(style, "display", lambda data, **options: shown.update(options, data=data))
+    figures.method_map("data")._ipython_display_()
+    assert shown["metadata"]["image/png"]["alt"].endswith("Lit: data.")
+    assert shown["data"].keys() == {"image/png", "text/plain"} and shown["raw"]

@@ -9,6 +9,7 @@ from urllib.parse import unquote
 
 import nbformat
 import pytest
+from sample_notebook import sample
 
 from tutorial_lib.agents import ALGORITHMS, slug
 from tutorial_lib.options import describe
@@ -20,9 +21,10 @@ NOTEBOOKS = sorted(ROOT.glob("notebooks/[0-9]*.ipynb"))
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory):
-    """Built as `make course` does, of the notebooks with their stored outputs."""
+    """Built as `make course` does, of the notebooks with their stored outputs, and of a sample after them."""
     pages, built = (tmp_path_factory.mktemp(name) for name in ("pages", "site"))
     shutil.copytree(ROOT / "notebooks", pages / "notebooks", ignore=shutil.ignore_patterns(".*"))
+    nbformat.write(sample(), pages / "notebooks" / "99_sample.ipynb")
     for folder in ("tutorial_lib", "benchmarks"):
         (pages / folder).symlink_to(ROOT / folder)
     (pages / "data").mkdir()
@@ -98,3 +100,45 @@ def first_cells(html: str) -> list[str]:
     bodies = "".join(re.findall(r"<tbody>(.*?)</tbody>", html, re.DOTALL))
     cells = re.findall(r"<tr[^>]*>\s*<td>(.*?)</td>", bodies, re.DOTALL)
     return [re.sub(r"<[^>]+>", "", cell).strip() for cell in cells]
+
+
+@pytest.fixture
+def sample_page(site, browser):
+    page = browser.new_page(viewport={"width": 1280, "height": 900})
+    page.goto((site / "notebooks" / "99_sample.html").as_uri())
+    page.wait_for_selector("mjx-container", state="attached")
+    yield page
+    page.close()
+
+
+def test_an_answer_is_folded_until_it_is_clicked_with_its_formulas(sample_page):
+    answer = sample_page.locator("details", has_text="three quarters")
+    assert not answer.locator("strong").is_visible() and answer.locator("summary").is_visible()
+    answer.locator("summary").click()
+    assert answer.locator("strong").inner_text() == "three quarters"
+    assert answer.locator("mjx-container").count() == 2
+    assert answer.locator("mjx-container").last.is_visible() and answer.locator("li").is_visible()
+    assert "$" not in answer.inner_text() and "details" not in sample_page.locator("article").inner_text()
+
+
+def test_a_solution_is_folded_with_all_that_it_shows(sample_page):
+    solution = sample_page.locator("details.hide")
+    hidden = [solution.locator("img"), solution.get_by_text("OK a is right"), solution.locator("pre").first]
+    assert not any(part.is_visible() for part in hidden)
+    assert solution.locator("summary").inner_text().strip() == "Show a solution"
+    solution.locator("summary").click()
+    assert all(part.is_visible() for part in hidden)
+    assert "SOLUTION" not in solution.inner_text()
+
+
+def test_an_image_has_the_text_that_its_figure_stored(sample_page):
+    texts = sample_page.locator("article img").evaluate_all("images => images.map(image => image.alt)")
+    assert texts == ['A "red" square.', "A blue square.", "A figure.", "A black square."]
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_no_image_of_a_page_is_without_a_text(site, path):
+    page = (site / "notebooks" / f"{path.stem}.html").read_text()
+    texts = re.findall(r'<img\b[^>]*?\balt="([^"]*)"', page)
+    assert len(texts) == page.count("<img") and all(texts)
+    assert not [text for text in texts if text.endswith(".png")]

@@ -8,6 +8,7 @@ import nbformat
 import pytest
 import slides
 from marks import LINES, remove_marks
+from sample_notebook import sample
 
 NOTEBOOKS = sorted(Path(__file__).parents[1].glob("notebooks/[0-9]*.ipynb"))
 
@@ -85,3 +86,22 @@ def test_every_page_fits_its_screen(made, path, browser):
     cells = nbformat.read(path, as_version=4).cells
     assert sum(shown["code"] for shown in pages) == sum(cell.cell_type == "code" for cell in cells)
     assert formulas > 0 and len(pages) >= 10
+
+
+def test_an_answer_and_a_solution_stand_on_pages_of_their_own(tmp_path, browser):
+    nbformat.write(sample(), tmp_path / "99_sample.ipynb")
+    slides.main(tmp_path, tmp_path)
+    page = browser.new_page(viewport={"width": 1280, "height": 720})
+    page.goto((tmp_path / "99_sample.html").as_uri())
+    page.wait_for_selector("body[data-pages]")
+    pages = page.locator(".slides > section > section")
+    texts = pages.evaluate_all("pages => pages.map(page => page.textContent)")
+    images = page.locator(".slides img").evaluate_all("images => images.map(image => image.alt)")
+    formulas = pages.evaluate_all("pages => pages.map(page => page.querySelectorAll('mjx-container').length)")
+    page.close()
+    (answer,) = [n for n, text in enumerate(texts) if "three quarters" in text]
+    assert texts[answer].strip().startswith("99 · SampleAnswer") and formulas[answer] == 2
+    assert not any(code in texts[answer] for code in ("show_all", "a = ..."))
+    (solution,) = [n for n, text in enumerate(texts) if "a = 3 / 4" in text]
+    assert "a = ..." in texts[solution - 1] and solution - 1 == answer + 1
+    assert images[:2] == ['A "red" square.', "A blue square."] and images[3] == "A black square."

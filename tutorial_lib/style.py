@@ -49,7 +49,18 @@ class Picture(Figure):
     """This is a figure that a notebook stores as a PNG image of 256 colours.
 
     The image has at most half of the bytes of a full-colour image, and the difference is not visible.
+    `described` sets what the figure shows, in words.
     """
+
+    description = ""
+
+    def alt_text(self) -> str:
+        """Returns the text that stands in place of the image where it cannot be seen.
+
+        A figure without a description gets one from the titles and labels of its panels.
+        """
+        panels = [_panel_text(ax) for ax in self.axes if ax.get_visible()]
+        return self.description or "Figure. " + " ".join(filter(None, panels))
 
     def small_png(self) -> bytes:
         """Returns the figure as a PNG image of 256 colours."""
@@ -62,9 +73,29 @@ class Picture(Figure):
 
     # IPython prefers this method to matplotlib's own display. It would not prefer _repr_png_.
     def _ipython_display_(self):
-        """Shows the image of 256 colours in a notebook."""
-        png = base64.b64encode(self.small_png()).decode()
-        display({"image/png": png, "text/plain": repr(self)}, raw=True)
+        """Shows the image of 256 colours in a notebook, which stores the alternative text beside it."""
+        data = {"image/png": base64.b64encode(self.small_png()).decode(), "text/plain": repr(self)}
+        display(data, metadata={"image/png": {"alt": self.alt_text()}}, raw=True)
+
+
+def _panel_text(ax) -> str:
+    """Returns one sentence from the title, the axis labels and the legend's entries of a panel."""
+    title = ax.get_title() or ax.get_title("left") or ax.get_title("right")
+    axes = " over ".join(filter(None, (ax.get_ylabel(), ax.get_xlabel())))
+    entries = ", ".join(dict.fromkeys(ax.get_legend_handles_labels()[1]))
+    words = "; ".join(" ".join(text.split()) for text in (title, axes, entries) if text)
+    return f"{words}." if words else ""
+
+
+def described(figure: Picture, text: str) -> Picture:
+    """Sets what a figure shows, in words, as its alternative text, and returns the figure.
+
+    Raises ValueError for an empty text.
+    """
+    if not text.strip():
+        raise ValueError("the description of a figure is empty: say what the figure shows")
+    figure.description = " ".join(text.split())
+    return figure
 
 
 def subplots(*args: Any, **options: Any) -> tuple[Picture, Any]:

@@ -31,13 +31,17 @@ function blocksOf(slide) {
     const markdown = cell.querySelector(".jp-RenderedMarkdown");
     if (markdown && cell.classList.contains("jp-MarkdownCell")) {
       step += 1;
+      if (markdown.classList.contains("celltag_answer")) {
+        for (const node of answerOf(markdown)) blocks.push({ node, step, fresh: node.tagName === "H3" });
+        continue;
+      }
       for (const node of [...markdown.children]) {
         const heading = /^H[123]$/.test(node.tagName);
         blocks.push({ node, step, heading, fresh: heading });
       }
       continue;
     }
-    const solution = cell.classList.contains("celltag_hide-input");
+    const solution = ["hide-cell", "hide-input"].some((tag) => cell.classList.contains(`celltag_${tag}`));
     const code = cell.querySelector(".jp-InputArea-editor");
     if (code) blocks.push({ node: make("div", "code", ...code.childNodes), step: ++step, fresh: solution });
     for (const output of cell.querySelectorAll(".jp-OutputArea-child")) {
@@ -49,6 +53,13 @@ function blocksOf(slide) {
   }
   if (blocks.length) blocks[0].fresh = true;
   return blocks;
+}
+
+// What is folded elsewhere, after the word to click on as a heading: an answer begins a page of its own.
+function answerOf(markdown) {
+  const details = markdown.querySelector("details");
+  const [summary, ...rest] = details.children;
+  return [make("h3", "", summary.textContent), ...rest];
 }
 
 // The rows of a table that are too many for the page go into a table of their own, under the same head.

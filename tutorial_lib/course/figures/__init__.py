@@ -10,6 +10,7 @@ from tutorial_lib.course.figures.discounting import *
 from tutorial_lib.course.figures.episodes import *
 from tutorial_lib.course.figures.luck import *
 from tutorial_lib.course.figures.maximisation_bias import *
+from tutorial_lib.course.figures.method_map import *
 from tutorial_lib.course.figures.penalty import *
 from tutorial_lib.course.figures.reconstruction import *
 from tutorial_lib.course.figures.recordings import *

@@ -1,0 +1,56 @@
+"""A small notebook with one of each kind of cell that the site, slides and students' version change."""
+
+import base64
+import io
+
+from nbformat import NotebookNode
+from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook, new_output
+from PIL import Image
+
+FIRST = """# 99 · Sample
+
+> **Does it fold?**
+
+After this notebook you will be able to fold.
+
+**Before this:** nothing. **Paper:** none. **Time:** 1 minute to read, 1 second to run."""
+ANSWER = """<details>
+<summary>Answer</summary>
+
+It is **three quarters**, because $V_c$ is a mean:
+
+$$V_c = \\frac{3}{4}$$
+
+- The common wrong guess is one half.
+
+</details>"""
+
+
+def picture(colour: str, text: str | None) -> NotebookNode:
+    """An output with a square of one colour, and its alternative text where there is one."""
+    file = io.BytesIO()
+    Image.new("RGB", (60, 60), colour).save(file, "PNG")
+    data = {"image/png": base64.b64encode(file.getvalue()).decode(), "text/plain": "<Picture>"}
+    return new_output("display_data", data, metadata={"image/png": {"alt": text}} if text else {})
+
+
+def sample() -> NotebookNode:
+    """The notebook, with outputs as if it had been executed."""
+    solution = "# SOLUTION\na = 3 / 4\nshow(a)\n# END SOLUTION"
+    printed = new_output("stream", name="stdout", text="OK  a is right\n")
+    shown = [picture("red", 'A "red" square.'), picture("blue", "A blue square."), picture("green", None)]
+    cells = [
+        new_markdown_cell(FIRST, metadata={"slideshow": {"slide_type": "slide"}}),
+        new_markdown_cell("**Predict.** How large is $V_c$?"),
+        new_code_cell("show_all()", outputs=shown, execution_count=1),
+        new_markdown_cell(ANSWER, metadata={"tags": ["answer"]}),
+        new_code_cell("a = ...", execution_count=2),
+        new_code_cell(
+            solution,
+            outputs=[printed, picture("black", "A black square.")],
+            execution_count=3,
+            metadata={"tags": ["hide-cell"]},
+        ),
+    ]
+    kernel = {"kernelspec": {"display_name": "Python 3", "language": "python", "name": "python3"}}
+    return new_notebook(cells=cells, metadata=kernel)
