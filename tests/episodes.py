@@ -4,8 +4,9 @@ import functools
 from typing import NamedTuple
 
 import numpy as np
+import pytest
 
-from tutorial_lib.tasks import TASKS, make_env
+from tutorial_lib.tasks import make_env, simulator_of
 
 
 class Episode(NamedTuple):
@@ -30,6 +31,13 @@ class Episode(NamedTuple):
     def first(self, steps: int) -> "Episode":
         """Its first steps."""
         return Episode(*(part[: steps + 1] for part in self))
+
+
+def needs_simulator(task):
+    """The mark of a test that plays a task: it skips, and says why, where the simulator is not installed."""
+    simulator = simulator_of(task)
+    reason = f"{simulator.package} is not installed: {simulator.remedy}"
+    return pytest.mark.skipif(bool(simulator.missing()), reason=reason)
 
 
 @functools.cache
@@ -60,7 +68,7 @@ def _position(env):
 @functools.cache
 def reference(name: str) -> Episode:
     """The episode of seed 3, in an environment that has played nothing before."""
-    return play(make_env(TASKS[name]), seed=3)
+    return play(make_env(name), seed=3)
 
 
 def assert_same(one: Episode, other: Episode) -> None:

@@ -9,10 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from episodes import needs_simulator
 from packaging.requirements import Requirement
 from packaging.version import Version
 
-from tutorial_lib.tasks import TASKS, make_env
+from tutorial_lib.tasks import SIMULATORS, all_tasks, get_task, make_env
 
 ROOT = Path(__file__).parents[1]
 needs_venv = pytest.mark.skipif(
@@ -38,9 +39,9 @@ def _applying(lines, environment=None):
     return {r.name: r for r in found}
 
 
-def _locked(environment=None):
-    """The requirements in environment.lock that apply to a machine, by name."""
-    lines = (ROOT / "environment.lock").read_text().splitlines()
+def _locked(environment=None, lock="environment.lock"):
+    """The requirements in a lock that apply to a machine, by name."""
+    lines = (ROOT / lock).read_text().splitlines()
     return _applying([line for line in lines if not line.startswith("#")], environment)
 
 
@@ -48,42 +49,63 @@ def _locked(environment=None):
 @pytest.mark.parametrize("system", SYSTEMS)
 def test_every_direct_dependency_is_locked_on_every_system(system, python):
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    direct = sum(project["optional-dependencies"].values(), project["dependencies"])
+    extras = project["optional-dependencies"]
+    mujoco = extras.pop("mujoco")
+    direct = sum(extras.values(), project["dependencies"])
     there = SYSTEMS[system] | {"python_version": python, "python_full_version": f"{python}.0"}
     locked = _locked(there)
     assert _applying(direct, there).keys() <= locked.keys(), "run `make lock`"
+    added = _locked(there, "mujoco.lock")
+    assert _applying(mujoco, there).keys() <= added.keys() and not added.keys() & locked.keys()
     simulators = [name for name in locked if name.startswith("pybullet")]
     ready = system == "Linux" and python == "3.11"  # the only ready-made wheel of pybullet itself
     assert simulators == ["pybullet" if ready or system == "Linux on Arm" else "pybullet-arm64"]
     assert ("pywinpty" in locked) == ("colorama" in locked) == (system == "Windows")
 
 
-def test_the_lock_pins_and_names_no_address():
-    assert all(re.fullmatch(r"==[\d.]+\w*", str(r.specifier)) for r in _locked().values())
-    assert "://" not in (ROOT / "environment.lock").read_text()
+@pytest.mark.parametrize("lock", ["environment.lock", "mujoco.lock"])
+def test_a_lock_pins_and_names_no_address(lock):
+    assert all(re.fullmatch(r"==[\d.]+\w*", str(r.specifier)) for r in _locked(lock=lock).values())
+    assert "://" not in (ROOT / lock).read_text()
 
 
 @needs_venv
-def test_installed_versions_are_the_locked_ones():
+@pytest.mark.parametrize(
+    "lock",
+    ["environment.lock", pytest.param("mujoco.lock", marks=needs_simulator(get_task("PointGoal1")))],
+)
+def test_installed_versions_are_the_locked_ones(lock):
+    locked = _locked(lock=lock)
     # `public` leaves out the build, as in 2.13.0+cpu.
-    installed = {name: Version(metadata.version(name)).public for name in _locked()}
-    assert installed == {name: str(r.specifier).removeprefix("==") for name, r in _locked().items()}
+    installed = {name: Version(metadata.version(name)).public for name in locked}
+    assert installed == {name: str(r.specifier).removeprefix("==") for name, r in locked.items()}
 
 
 @needs_venv
-def test_pip_check_has_the_one_known_complaint():
+def test_pip_check_has_only_the_known_complaints():
     """bullet-safety-gym's metadata asks for an older gymnasium than the one it runs on below.
 
-    Where pybullet-arm64 takes the place of pybullet, it asks for that, too.
+    Where pybullet-arm64 takes the place of pybullet, it asks for that, too. Where the extra `mujoco` is
+    installed, it asks for older releases, and for packages of which the course uses nothing.
     """
     known = {"bullet-safety-gym 1.4.0 has requirement gymnasium~=0.28.1, but you have gymnasium 1.4.0."}
     if "pybullet" not in _locked():
         known.add("bullet-safety-gym 1.4.0 requires pybullet, which is not installed.")
+    if not SIMULATORS["mujoco"].missing():
+        known |= {
+            "mujoco 4.0.0 requires mujoco-studio, which is not installed.",
+            "safety-gymnasium 1.0.0 requires gymnasium-robotics, which is not installed.",
+            "safety-gymnasium 1.0.0 requires pygame, which is not installed.",
+            "safety-gymnasium 1.0.0 has requirement gymnasium==0.28.1, but you have gymnasium 1.4.0.",
+            "safety-gymnasium 1.0.0 has requirement mujoco==2.3.3, but you have mujoco 4.0.0.",
+        }
     check = subprocess.run([sys.executable, "-m", "pip", "check"], capture_output=True, text=True)
     assert set(check.stdout.splitlines()) == known
 
 
-@pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
+@pytest.mark.parametrize(
+    "task", [pytest.param(task, id=task.name, marks=needs_simulator(task)) for task in all_tasks().values()]
+)
 def test_every_task_runs(task):
     env = make_env(task)
     try:

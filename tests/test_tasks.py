@@ -1,4 +1,4 @@
-"""The eight tasks against a second copy of the paper's Tables 3 and 5 and of DSRL's constants."""
+"""The records of the tasks against a second copy of the paper's Tables 3 and 5 and of DSRL's constants."""
 
 import dataclasses
 import re
@@ -7,7 +7,17 @@ import sys
 
 import pytest
 
-from tutorial_lib.tasks import SIMULATORS, TASKS, get_task, make_env
+from tutorial_lib.tasks import (
+    DSRL_FRONTIER,
+    MUJOCO_TASKS,
+    SIMULATORS,
+    TASKS,
+    all_tasks,
+    check_installed,
+    get_task,
+    make_env,
+)
+from tutorial_lib.tasks.recipes import RECIPES
 from tutorial_lib.tasks.scene import CIRCLE, RUN
 
 PAPER = {  # Table 3: T, action and state dimension, cost range. Table 5: the gammas; small, middle, high
@@ -32,8 +42,49 @@ DSRL = {  # its file, and the returns that its scores divide by
 }
 
 
-def test_the_bullet_tasks_are_the_papers_eight():
-    assert {name for name, task in TASKS.items() if task.family == "bullet"} == set(PAPER)
+# Table 6's tasks: the id of the environment, T, state and action dimension, DSRL's C max, its number of
+# episodes, R min and R max.
+TABLE6 = {
+    "PointCircle1": ("SafetyPointCircle1-v0", 500, 28, 2, 200, 1098, 20.067626953125, 61.72819519042969),
+    "PointGoal1": ("SafetyPointGoal1-v0", 1000, 60, 2, 100, 2022, 0.01196012764197707, 30.071114857340543),
+    "PointPush1": ("SafetyPointPush1-v0", 1000, 76, 2, 150, 2379, 0.0014001545292344209, 16.518654299293367),
+    "PointButton1": (
+        "SafetyPointButton1-v0", 1000, 76, 2, 200, 2268, 0.008822109034937853, 41.19301568767707
+    ),
+    "HalfCheetahVelocity": (
+        "SafetyHalfCheetahVelocity-v1", 1000, 17, 6, 250, 2495, 5.7509765625, 2806.93310546875
+    ),
+    "HopperVelocity": (
+        "SafetyHopperVelocity-v1", 1000, 11, 3, 250, 2240, 37.05154800415039, 1911.396728515625
+    ),
+    "AntVelocity": ("SafetyAntVelocity-v1", 1000, 27, 8, 250, 2249, 6.1519012451171875, 2976.276611328125),
+}  # fmt: skip
+
+
+def test_the_tasks_are_the_papers_eight_and_the_seven_of_its_table_6():
+    assert TASKS.keys() == PAPER.keys() and {task.family for task in TASKS.values()} == {"bullet"}
+    assert MUJOCO_TASKS.keys() == TABLE6.keys()
+    assert {task.family for task in MUJOCO_TASKS.values()} == {"mujoco"}
+    assert all_tasks() == TASKS | MUJOCO_TASKS and len(all_tasks()) == 15
+    assert DSRL_FRONTIER.keys() == RECIPES.keys() == all_tasks().keys()
+
+
+@pytest.mark.parametrize("name", TABLE6)
+def test_matches_safety_gymnasium_and_dsrl(name):
+    task, (env_id, *numbers) = MUJOCO_TASKS[name], TABLE6[name]
+    ours = task.horizon, task.obs_dim, task.act_dim, task.cost_range
+    assert [task.env_id, *ours, task.min_return, task.max_return] == [env_id, *numbers[:4], *numbers[5:]]
+    simulator, version = env_id.split("-")
+    assert task.dsrl_file == f"{simulator}Gymnasium-{version}-{task.cost_range}-{numbers[4]}.hdf5"
+    assert task.terminates == (task.robot in ("Hopper", "Ant"))
+
+
+@pytest.mark.parametrize("name", TABLE6)
+def test_what_the_paper_leaves_open_follows_the_field_and_the_papers_rule(name):
+    """The thresholds are OSRL's. Appendix B.2 wants discount factors with gamma^T of 0.05, 0.1 and 0.2."""
+    task = MUJOCO_TASKS[name]
+    assert task.thresholds == (20, 40, 80)
+    assert [gamma**task.horizon for gamma in task.gammas] == pytest.approx([0.05, 0.1, 0.2], rel=0.02)
 
 
 @pytest.mark.parametrize("name", PAPER)
@@ -107,7 +158,8 @@ def test_an_unknown_family_is_an_error_that_lists_the_families():
 
 
 def test_another_family_needs_one_entry(monkeypatch):
-    monkeypatch.setitem(SIMULATORS, "chess", (lambda task, **options: (task.name, options), "chess-gym"))
+    chess = SIMULATORS["bullet"]._replace(make=lambda task, **options: (task.name, options), modules=())
+    monkeypatch.setitem(SIMULATORS, "chess", chess)
     assert make_env(dataclasses.replace(TASKS["BallRun"], family="chess"), size=8) == ("BallRun", {"size": 8})
 
 
@@ -123,6 +175,24 @@ def test_a_simulator_that_is_not_installed_is_an_error_that_says_what_to_install
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert f"BallRun is simulated by bullet-safety-gym, and module '{module}' is not installed" in done.stdout
     assert "pip install" in done.stdout
+
+
+def test_nothing_is_imported_to_see_whether_a_simulator_is_installed():
+    program = (
+        "import sys\n"
+        "from tutorial_lib.tasks import all_tasks, simulator_of\n"
+        "found = [simulator_of(task).missing() for task in all_tasks().values()]\n"
+        "print(sorted({'gymnasium', 'pybullet', 'mujoco', 'safety_gymnasium'} & set(sys.modules)))"
+    )
+    assert subprocess.run([sys.executable, "-c", program], capture_output=True).stdout.strip() == b"[]"
+
+
+def test_an_extra_that_is_not_installed_is_an_error_that_names_its_command(monkeypatch):
+    monkeypatch.setitem(sys.modules, "safety_gymnasium", None)
+    check_installed(TASKS["BallRun"])
+    for use in (check_installed, make_env):
+        with pytest.raises(ValueError, match="PointPush1 is simulated by safety-gymnasium, .*make mujoco"):
+            use(MUJOCO_TASKS["PointPush1"])
 
 
 # --- Names ---

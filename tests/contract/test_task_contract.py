@@ -12,15 +12,26 @@ import gymnasium
 import matplotlib
 import numpy as np
 import pytest
-from episodes import Episode, assert_same, play, reference, shared_env
+from episodes import Episode, assert_same, needs_simulator, play, reference, shared_env
 from gymnasium.utils.env_checker import check_env
 from matplotlib.figure import Figure
 
-from tutorial_lib.tasks import SIMULATORS, TASKS, get_task, make_env, scene_of
+from tutorial_lib.tasks import SIMULATORS, all_tasks, get_task, make_env, scene_of
 
 ROOT = Path(__file__).parents[2]
+TASKS = all_tasks()
 FIRST_OF_FAMILY = [next(t for t in TASKS.values() if t.family == family) for family in SIMULATORS]
-every_task = pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
+every_record = pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
+
+
+def played(tasks):
+    return pytest.mark.parametrize(
+        "task", [pytest.param(task, id=task.name, marks=needs_simulator(task)) for task in tasks]
+    )
+
+
+every_task = played(TASKS.values())
+first_of_every_family = played(FIRST_OF_FAMILY)
 
 
 @pytest.fixture(autouse=True)
@@ -41,14 +52,14 @@ def rise(values) -> bool:
 # --- The record ---
 
 
-@every_task
+@every_record
 def test_a_task_is_found_by_its_name_and_by_its_environments(task):
     assert TASKS[task.name] is get_task(task.name) is get_task(task.env_id) is task
     assert task.name.startswith(task.robot) and task.family in SIMULATORS
     assert sum(other.env_id == task.env_id for other in TASKS.values()) == 1
 
 
-@every_task
+@every_record
 def test_the_limits_rise_and_each_has_a_name(task):
     assert task.thresholds and task.thresholds[0] > 0 and rise(task.thresholds)
     assert len(set(task.limit_names)) == len(task.limit_names) == len(task.thresholds)
@@ -58,7 +69,7 @@ def test_the_limits_rise_and_each_has_a_name(task):
         dataclasses.replace(task, limit_names=(*task.limit_names, "more"))
 
 
-@every_task
+@every_record
 def test_the_constants_are_in_order(task):
     assert task.gammas and rise((0.0, *task.gammas, 1.0))
     assert task.min_return < task.max_return
@@ -66,7 +77,7 @@ def test_the_constants_are_in_order(task):
     assert max(task.thresholds) <= task.cost_range <= task.horizon * task.max_step_cost
 
 
-@every_task
+@every_record
 def test_records_compare_by_value(task):
     copy = dataclasses.replace(task)
     assert copy == task and hash(copy) == hash(task)
@@ -101,7 +112,7 @@ def test_every_step_costs_between_zero_and_the_recorded_maximum(task):
         assert episode.costs.min() >= 0 and episode.costs.max() <= task.max_step_cost
 
 
-@pytest.mark.parametrize("task", FIRST_OF_FAMILY, ids=SIMULATORS)
+@first_of_every_family
 def test_the_recorded_maximum_is_paid_for_some_step(task):
     assert max(reference(task.name).costs.max(), other(task.name).costs.max()) == task.max_step_cost
 
@@ -131,7 +142,7 @@ def test_a_seed_repeats_an_episode_whatever_was_played_before(task):
         assert_same(play(env, seed=3, steps=8), reference(task.name).first(8))
 
 
-@pytest.mark.parametrize("task", FIRST_OF_FAMILY, ids=SIMULATORS)
+@first_of_every_family
 def test_a_seed_repeats_an_episode_in_another_process(task, tmp_path):
     path = tmp_path / "episode.npz"
     program = "import sys, numpy as np, episodes; np.savez(sys.argv[1], *episodes.reference(sys.argv[2]))"
@@ -223,8 +234,7 @@ def test_pictures_are_drawn_only_on_request_and_only_as_arrays(task):
 
 # --- The scene ---
 
-has_scene = [task for task in TASKS.values() if task.scene is not None]
-every_scene = pytest.mark.parametrize("task", has_scene, ids=[task.name for task in has_scene])
+every_scene = played([task for task in TASKS.values() if task.scene is not None])
 
 
 @every_task

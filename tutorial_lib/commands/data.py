@@ -9,15 +9,20 @@ from tutorial_lib.commands import check_counts
 
 
 def tasks() -> None:
-    """List the tasks with their horizons, dimensions, limits and reference returns."""
+    """List the tasks with their horizons, dimensions, limits and reference returns.
+
+    The last column says whether the simulator of the task is installed, and what to do where it is not.
+    """
     import pandas as pd
 
-    from tutorial_lib.tasks import TASKS
+    from tutorial_lib.tasks import all_tasks, simulator_of
 
     columns = (
         "name family horizon obs_dim act_dim gammas thresholds cost_range min_return max_return terminates"
     )
-    rows = [{name: getattr(task, name) for name in columns.split()} for task in TASKS.values()]
+    rows = [{name: getattr(task, name) for name in columns.split()} for task in all_tasks().values()]
+    for row, simulator in zip(rows, map(simulator_of, all_tasks().values()), strict=True):
+        row["simulator"] = f"not installed: {simulator.remedy}" if simulator.missing() else "installed"
     print(pd.DataFrame(rows).to_string(index=False))
 
 
@@ -66,11 +71,13 @@ def collect(
         runs: This folder holds the saved state of the collection.
         workers: This number of PPO runs train at the same time.
     """
-    from tutorial_lib.data import collect as collecting
-    from tutorial_lib.tasks import get_task
+    from tutorial_lib.tasks import check_installed, get_task
     from tutorial_lib.tasks.recipes import RECIPES
 
     check_counts(steps=steps, episodes=episodes, workers=workers)
+    check_installed(get_task(task))
+    from tutorial_lib.data import collect as collecting  # takes seconds
+
     recipe = RECIPES[get_task(task).name]
     recipe = dataclasses.replace(recipe, steps=steps or recipe.steps, episodes=episodes or recipe.episodes)
     out = out or runs / f"{get_task(task).name}.hdf5"

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from tutorial_lib.data.dataset import KEYS, Dataset
-from tutorial_lib.tasks import TASKS, Task
+from tutorial_lib.tasks import Task, all_tasks
 
 FLAGS = ("terminals", "timeouts")
 LARGEST = 1e6
@@ -131,12 +131,12 @@ def check_task(attributes: dict, task: Task, report: Report) -> None:
     DSRL's files have no such attribute, so that only the name can tell.
     """
     # The shapes cannot tell: BallRun and CarRun have the same.
-    of_names = {other.dsrl_file: other.name for other in TASKS.values()}
+    of_names = {other.dsrl_file: other.name for other in all_tasks().values()}
     for what, made_for in (
         ("attribute task", str(attributes.get("task", task.name))),
         ("its name", of_names.get(report.path.name, task.name)),
     ):
-        if made_for in TASKS and made_for != task.name:
+        if made_for in all_tasks() and made_for != task.name:
             report.error(what, f"{made_for}, not {task.name}", "take another task or file")
 
 
@@ -177,7 +177,7 @@ def _check_lengths(data: Dataset, task: Task, report: Report) -> None:
 def _tasks_of(lengths: set[int], task: Task) -> str:
     """In words: the tasks with the shapes of `task` whose horizon is the only one of `lengths`."""
     dims = (task.obs_dim, task.act_dim)
-    fits = [t for t in TASKS.values() if {t.horizon} == lengths and (t.obs_dim, t.act_dim) == dims]
+    fits = [t for t in all_tasks().values() if {t.horizon} == lengths and (t.obs_dim, t.act_dim) == dims]
     return " or ".join(f"{t.name}'s, which has {t.horizon}" for t in fits) or "another task's"
 
 

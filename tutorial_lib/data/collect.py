@@ -30,8 +30,7 @@ from tutorial_lib.data.hdf5 import read_dataset, write_dataset
 from tutorial_lib.data.ppo import episode_files, run_ppo
 from tutorial_lib.data.thinning import thin
 from tutorial_lib.files import check_output
-from tutorial_lib.tasks import Task
-from tutorial_lib.tasks.bullet import pybullet_package
+from tutorial_lib.tasks import Task, simulator_of
 from tutorial_lib.tasks.recipes import Recipe
 
 SOURCES = ("priced-0", "lagrangian-0")
@@ -102,7 +101,8 @@ def collect(
 
 def _origin(task: Task, recipe: Recipe) -> dict[str, str]:
     """What a dataset's file says of its origin, whatever the episodes."""
-    packages = ("stable-baselines3", pybullet_package(), "bullet-safety-gym", "torch")
+    simulator = simulator_of(task)
+    packages = ("stable-baselines3", simulator.engine(), simulator.package, "torch")
     return {
         "task": task.name,
         "made_by": f"c2iql collect {task.name}",

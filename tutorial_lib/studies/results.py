@@ -24,7 +24,7 @@ from tutorial_lib.data.places import why_missing
 from tutorial_lib.data.sources import SHIPPED_DATA
 from tutorial_lib.scores import with_scores
 from tutorial_lib.studies.paper import Claim
-from tutorial_lib.tasks import TASKS
+from tutorial_lib.tasks import all_tasks
 
 RESULTS = SHIPPED_DATA / "results"
 """The folder of the shipped results."""
@@ -103,7 +103,7 @@ def _rows_of(data: bytes, required: Sequence[str]) -> list[tuple[int, dict[str, 
 def _problem_of(column: str, text: str, is_log: bool) -> str:
     """What is wrong with a value, or no words. The columns of options are checked by `_check_options`."""
     if column == "task":
-        return "" if text in TASKS else "must be the name of a task"
+        return "" if text in all_tasks() else "must be the name of a task"
     if not (is_log or column in OWN_COLUMNS or column == "reconstruction_error"):
         return ""
     if column in ("algorithm", "profile"):

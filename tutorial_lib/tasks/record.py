@@ -1,7 +1,19 @@
-"""The tasks as frozen records of what the simulator, the paper and DSRL say about them.
+"""The tasks as frozen records of what the simulators, the paper and DSRL say about them.
 
-Sources: horizon, dimensions and cost range from the paper's Table 3, discount factors and thresholds
-from its Table 5; file names and reference returns from DSRL (Liu et al. 2024, CC BY 4.0).
+`TASKS` are the eight tasks of the paper's Table 1 and of the course. `MUJOCO_TASKS` are the seven tasks of
+Table 6, whose simulator is an optional extra.
+
+Sources of `TASKS`: horizon, dimensions and cost range from the paper's Table 3, discount factors and
+thresholds from its Table 5; file names and reference returns from DSRL (Liu et al. 2024, CC BY 4.0). Sources
+of `MUJOCO_TASKS`: horizon and dimensions from safety-gymnasium 1.0.0, all else but the following from DSRL.
+
+The paper does not publish the discount factors and the thresholds of its Table 6. So both are chosen here.
+
+- The discount factors follow the rule of the paper's Appendix B.2 for the horizon T: gamma_1^T is about 0.05,
+  gamma_2^T about 0.1 and gamma_3^T about 0.2. They have four decimals, because with three the second and the
+  third would be equal for T = 1000.
+- The thresholds are 20, 40 and 80, the limits under which DSRL and OSRL evaluate these tasks. They are below
+  half of the cost range, so that they do not follow the rule that Appendix B.2 has for thresholds.
 """
 
 import difflib
@@ -24,7 +36,7 @@ class Task:
     robot: str
     """What moves, e.g. 'Ball'."""
     env_id: str
-    """The environment's id in gymnasium's registry."""
+    """The id under which the simulator's package registers the environment with gymnasium."""
     horizon: int
     """T: an episode has at most so many steps."""
     obs_dim: int
@@ -97,6 +109,26 @@ def _bullet(robot, scene, horizon, dims, gammas, thresholds, cost_range, traject
     )
 
 
+def _mujoco(name, robot, horizon, dims, cost_range, trajectories, returns, falls=False):
+    version = "v1" if name.endswith("Velocity") else "v0"
+    return Task(
+        name=name,
+        family="mujoco",
+        robot=robot,
+        env_id=f"Safety{name}-{version}",
+        horizon=horizon,
+        obs_dim=dims[0],
+        act_dim=dims[1],
+        gammas={500: (0.994, 0.9954, 0.9968), 1000: (0.997, 0.9977, 0.9984)}[horizon],
+        thresholds=(20, 40, 80),
+        cost_range=cost_range,
+        dsrl_file=f"Safety{name}Gymnasium-{version}-{cost_range}-{trajectories}.hdf5",
+        min_return=returns[0],
+        max_return=returns[1],
+        terminates=falls,
+    )
+
+
 _MEDIUM = (0.985, 0.99, 0.993)
 _LONG = (0.99, 0.993, 0.995)
 
@@ -115,6 +147,26 @@ TASKS: dict[str, Task] = {
     )
 }
 
+MUJOCO_TASKS: dict[str, Task] = {
+    task.name: task
+    for task in (
+        #       name, robot                T   (obs, act)  C max  n   (R min, R max)
+        _mujoco("PointCircle1", "Point", 500, (28, 2), 200, 1098, (20.067626953125, 61.72819519042969)),
+        _mujoco("PointGoal1", "Point", 1000, (60, 2), 100, 2022, (0.01196012764197707, 30.071114857340543)),
+        _mujoco("PointPush1", "Point", 1000, (76, 2), 150, 2379, (0.0014001545292344209, 16.518654299293367)),
+        _mujoco("PointButton1", "Point", 1000, (76, 2), 200, 2268, (0.008822109034937853, 41.19301568767707)),
+        _mujoco(
+            "HalfCheetahVelocity", "HalfCheetah", 1000, (17, 6), 250, 2495, (5.7509765625, 2806.93310546875)
+        ),
+        _mujoco(
+            "HopperVelocity", "Hopper", 1000, (11, 3), 250, 2240, (37.05154800415039, 1911.396728515625), True
+        ),
+        _mujoco(
+            "AntVelocity", "Ant", 1000, (27, 8), 250, 2249, (6.1519012451171875, 2976.276611328125), True
+        ),
+    )
+}
+
 DSRL_FRONTIER = {
     "BallRun": {0: 440, 20: 450, 50: 900, 80: 1300},
     "CarRun": {0: 570},
@@ -124,17 +176,32 @@ DSRL_FRONTIER = {
     "CarCircle": {0: 430, 30: 480, 100: 530},
     "DroneCircle": {0: 680, 40: 780, 90: 990},
     "AntCircle": {0: 260, 75: 350, 130: 450},
+    "PointCircle1": {0: 45, 75: 50, 140: 56, 180: 61},
+    "PointGoal1": {0: 27, 10: 30, 50: 28, 100: 27},
+    # DSRL's plots of PointPush1 and CarPush1 seem to have each other's titles: only so do they fit its
+    # constants. These are from the plot with the title CarPush1.
+    "PointPush1": {0: 14.5, 45: 16.5, 100: 13, 150: 11},
+    "PointButton1": {0: 35, 20: 41, 100: 40, 200: 35},
+    "HalfCheetahVelocity": {0: 2700, 100: 2750, 250: 2800},
+    "HopperVelocity": {0: 1700, 120: 1750, 250: 1900},
+    "AntVelocity": {5: 2700, 50: 2850, 140: 2970, 250: 2850},
 }
 """The best returns in DSRL's data at some costs, read off its published plots."""
 
 
+def all_tasks() -> dict[str, Task]:
+    """The fifteen tasks by their names: `TASKS`, then `MUJOCO_TASKS`, installed or not."""
+    return TASKS | MUJOCO_TASKS
+
+
 def get_task(name: str) -> Task:
     """The task called `name`; its gymnasium id works too. Raises ValueError with the nearest names."""
-    if name in TASKS:
-        return TASKS[name]
-    by_env_id = {task.env_id: task for task in TASKS.values()}
+    tasks = all_tasks()
+    if name in tasks:
+        return tasks[name]
+    by_env_id = {task.env_id: task for task in tasks.values()}
     if name in by_env_id:
         return by_env_id[name]
-    close = difflib.get_close_matches(name, TASKS, n=2, cutoff=0.4)
+    close = difflib.get_close_matches(name, tasks, n=2, cutoff=0.4)
     hint = f"did you mean {' or '.join(close)}? " if close else ""
-    raise ValueError(f"unknown task {name!r}: {hint}the tasks are {', '.join(TASKS)}")
+    raise ValueError(f"unknown task {name!r}: {hint}the tasks are {', '.join(tasks)}")
