@@ -16,7 +16,7 @@ FOUNDATION = "config losses networks costs tasks data files style matmul".split(
 LOOPS = "training checkpoints playing scores".split()
 LAYERS = [FOUNDATION, ["agents"], LOOPS, ["options", "studies"], ["course"], ["commands"], ["__main__"]]
 """A module imports from its own layer and from those before it."""
-SHARED = "agent seeds lift player critic implicit lagrangian sequences".split()
+SHARED = "agent seeds lift player critic evaluation implicit lagrangian sequences".split()
 """The files of `agents` that are no algorithm's."""
 ALGORITHMS = [
     name for name in FILES if name.startswith("tutorial_lib.agents.") and name.split(".")[2] not in SHARED

@@ -15,18 +15,11 @@ Departures:
 
 The paper leaves points 2 to 4 open. The text of each option says what is known of it.
 
-Measured: `data/results/table1.csv` and `data/results/ablations.csv`; their tables stand in `data/README.md`.
-In profile `small`, some tasks have other options, for these reasons:
+6. Not in the paper, and off unless they are asked for: `clock`, `thresholds='range'`, a price in units of the
+   advantages' spread (`price_unit`), `evaluated_critic='mean'`, and `evaluators` with `tell='predicted'`.
 
-- DroneRun: with `time_limits='rate'`, agents stayed near the many episodes that never exceed the speed limit.
-  Their normalised reward was 0.61 under a limit of 110. With `time_limits='mask'` it is 0.70.
-- AntRun and AntCircle: a single action of an ant's gait changes the cost very little. With `unsafe_price=6`,
-  the cost was 43 under AntRun's limit of 30, and 98 under AntCircle's limit of 40. On AntCircle the heads of
-  the critics differ mostly by their error. With the higher price and a reconstruction model that is trained
-  for this error (`crm_noise_rate`), the cost became 55 (five seeds).
-- DroneCircle: the higher of two cost critics predicts costs of 52, 59 and 69 under the three limits, and the
-  costs are 5, 9 and 11 (study `ablations`). A single cost critic predicts 20, 29 and 34, the costs are 22, 32
-  and 36, and the normalised reward is higher by 0.05.
+Measured: `data/results/table1.csv` and `data/results/ablations.csv`; their tables stand in `data/README.md`,
+with the reasons for the options that some tasks have in profile `small`.
 """
 
 from collections.abc import Sequence
@@ -38,23 +31,12 @@ import torch
 from torch import Tensor, nn
 
 from tutorial_lib import losses
-from tutorial_lib.agents.evaluation import (
-    EvaluationConfig,
-    Evaluators,
-    evaluation_loss,
-    largest_that_fits,
-    limits_to_tell,
-    most_cost,
-)
+from tutorial_lib.agents import evaluation
+from tutorial_lib.agents.evaluation import EvaluationConfig, Evaluators
 from tutorial_lib.agents.implicit import ConstrainedAgent, ConstrainedConfig
 from tutorial_lib.agents.player import BudgetPlayer, Player
 from tutorial_lib.agents.seeds import Fields, Networks
-from tutorial_lib.costs.conditioning import (
-    ConditioningConfig,
-    after_step,
-    draw_thresholds,
-    encode,
-)
+from tutorial_lib.costs.conditioning import after_step, draw_thresholds, encode
 from tutorial_lib.costs.discounting import average_threshold
 from tutorial_lib.costs.reconstruction import (
     CostReconstruction,
@@ -68,10 +50,10 @@ from tutorial_lib.tasks import Task
 
 
 @dataclass(frozen=True)
-class C2IQLConfig(ConstrainedConfig, ReconstructionConfig, ConditioningConfig, EvaluationConfig):
+class C2IQLConfig(ConstrainedConfig, ReconstructionConfig, EvaluationConfig):
     """The options of C2IQL: those of CIQL, of the reconstruction model and of constraint conditioning."""
 
-    # "Measured", at the top of this file, has the reasons.
+    # The tables of `data/README.md` have the reasons.
     tasks = {
         "DroneRun": {"time_limits": "mask"},
         "AntRun": {"unsafe_price": 20.0},
@@ -81,7 +63,7 @@ class C2IQLConfig(ConstrainedConfig, ReconstructionConfig, ConditioningConfig, E
 
 
 @dataclass(frozen=True)
-class WithoutCRConfig(ConstrainedConfig, ConditioningConfig, EvaluationConfig):
+class WithoutCRConfig(ConstrainedConfig, EvaluationConfig):
     """The options of C2IQL without cost reconstruction."""
 
 
@@ -109,10 +91,6 @@ class C2IQL(ConstrainedAgent):
         super().__init__(task, config, *args, **kwargs)
         if self.clock and config.time_limits != "mask":
             raise ValueError("clock=True needs time_limits='mask': its limits are on the remaining cost")
-        if self.evaluates and not self.clock:
-            raise ValueError("evaluators need clock=True: they predict the remaining cost")
-        if not self.evaluates and self.conditioned and config.tell == "predicted":
-            raise ValueError("tell='predicted' needs evaluators: set evaluators=1")
         self.gammas = torch.tensor(self.cost_gammas, device=self.device)  # (m,)
         if self.reconstructs:  # untrained until `prepare` or `load_state`
             with torch.random.fork_rng(devices=[]):
@@ -204,11 +182,8 @@ class C2IQL(ConstrainedAgent):
 
         # Lines 6-8: cost reconstruction. The critic that predicts the highest cost counts.
         q_cost = net.target_cost_critics(s, a)  # (k, B, m)
-        cost, worst = self.episode_cost(q_cost).max(0)  # (B,)
-        if config.evaluated_critic == "highest":
-            q_cost = q_cost.take_along_dim(worst[None, :, None], 0).squeeze(0)  # (B, m)
-        else:
-            q_cost = q_cost.mean(0)
+        costs = self.episode_cost(q_cost)  # (k, B)
+        cost, q_cost = costs.amax(0), self.evaluated_heads(q_cost, costs)  # (B,) and (B, m)
 
         # Line 18: its target, which is needed here, too: it is the cost of the recorded step.
         # Eq. 16 prints V_c(s), but V_c(s') is meant.
@@ -244,9 +219,8 @@ class C2IQL(ConstrainedAgent):
         of_networks = {"value": value_loss, "cost_value": cost_value_loss, "critic": critic_loss}
         of_networks |= {"cost_critic": cost_critic_loss, "policy": policy_loss}
         if self.evaluates:
-            of_networks["evaluators"] = evaluation_loss(net, batch, s, s_next, self.task)
-        scalars = self.logged(cost, limit, v, q_reward, v_cost) | {"cost_mean": cost.mean()}
-        return of_networks, scalars
+            of_networks["evaluators"] = evaluation.evaluation_loss(net, batch, s, s_next, self.task)
+        return of_networks, self.logged(cost, limit, v, q_reward, v_cost) | {"cost_mean": cost.mean()}
 
     def player(self, limits: Sequence[float] | np.ndarray, seeds: Sequence[int], run: int = 0) -> Player:
         return BudgetPlayer(self, limits, run) if self.conditioned else super().player(limits, seeds, run)
@@ -270,7 +244,7 @@ class C2IQL(ConstrainedAgent):
             s = self.network_input(net, *x, t)
             action, _ = net.policy(s)
             if self.evaluates:
-                costs = net.evaluators(s, action) * most_cost(self.task, t)
+                costs = net.evaluators(s, action) * evaluation.most_cost(self.task, t)
             else:
                 costs = self.episode_cost(net.cost_critics(s, action))
             return costs.amax(0).cpu().numpy()
@@ -280,10 +254,10 @@ class C2IQL(ConstrainedAgent):
 
         The observations of step t are (E, obs).
         """
-        choices = limits_to_tell(self.task)
+        choices = evaluation.limits_to_tell(self.task)
         pairs = np.repeat(observations, len(choices), 0), np.tile(choices, len(observations))
         costs = self.predicted_cost(*pairs, run, t).reshape(len(observations), len(choices))
-        return largest_that_fits(choices, costs, left)
+        return evaluation.largest_that_fits(choices, costs, left)
 
     def diagnose(self, dataset: Dataset) -> dict[str, float]:
         """Returns the error of the reconstruction model, in unsafe steps per episode."""

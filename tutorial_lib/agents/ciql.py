@@ -48,8 +48,8 @@ class CIQL(ConstrainedAgent):
 
         # The cost of an action: the highest of the cost critics, and at least the recorded step (eq. 16).
         q_cost = net.target_cost_critics(s, a)  # (k, B, 1)
-        cost = self.episode_cost(q_cost).amax(0)  # (B,)
-        q_cost = q_cost.amax(0) if config.evaluated_critic == "highest" else q_cost.mean(0)  # (B, 1)
+        costs = self.episode_cost(q_cost)  # (k, B)
+        cost, q_cost = costs.amax(0), self.evaluated_heads(q_cost, costs)  # (B,) and (B, 1)
         mask = self.cost_mask(batch)[:, None]
         cost_target = losses.td_target(batch.costs[:, None], config.gamma, net.cost_value(s_next), mask)
         if config.recorded_step:

@@ -17,7 +17,8 @@ from torch import Tensor
 from tutorial_lib import losses
 from tutorial_lib.agents.critic import goes_on
 from tutorial_lib.agents.seeds import Fields, Networks
-from tutorial_lib.config import NOT_NEGATIVE, Config
+from tutorial_lib.config import NOT_NEGATIVE
+from tutorial_lib.costs.conditioning import ConditioningConfig
 from tutorial_lib.networks import Critics
 from tutorial_lib.tasks import Task
 
@@ -26,8 +27,8 @@ FINITE_LIMITS = 41
 
 
 @dataclass(frozen=True)
-class EvaluationConfig(Config):
-    """The options of fitted Q evaluation."""
+class EvaluationConfig(ConditioningConfig):
+    """The options of constraint conditioning and of fitted Q evaluation."""
 
     evaluators: Annotated[int, NOT_NEGATIVE] = 0
     """The number of critics that learn what the policy that acts will pay. The highest counts. With 0 there
@@ -35,6 +36,13 @@ class EvaluationConfig(Config):
     tell: Literal["left", "predicted"] = "left"
     """Which limit the policy is told at each step. With 'left', it is what is left of the limit (eq. 23).
     With 'predicted', it is the largest limit for which the evaluators predict no more cost than is left."""
+
+    def __post_init__(self):
+        super().__post_init__()
+        if self.evaluators and not self.clock:
+            raise ValueError("evaluators need clock=True: they predict the remaining cost")
+        if self.tell == "predicted" and not self.evaluators:
+            raise ValueError("tell='predicted' needs evaluators: set evaluators=1")
 
 
 class Evaluators(Critics):

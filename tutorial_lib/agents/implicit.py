@@ -160,6 +160,15 @@ class ConstrainedAgent(ImplicitAgent):
         """
         raise NotImplementedError
 
+    def evaluated_heads(self, q_cost: Tensor, costs: Tensor) -> Tensor:
+        """Returns the heads that V_c learns, (B, m), from those of k critics, (k, B, m).
+
+        `costs` (k, B) are the critics' costs of an episode (see `evaluated_critic`).
+        """
+        if self.config.evaluated_critic == "mean":
+            return q_cost.mean(0)
+        return q_cost.take_along_dim(costs.argmax(0)[None, :, None], 0).squeeze(0)
+
     def cost_mask(self, batch: Fields) -> Tensor:
         """Returns 1 where Q_c bootstraps and 0 where nothing follows, (B,)."""
         return goes_on(batch, self.config.time_limits)
