@@ -167,7 +167,7 @@ MUJOCO_TASKS: dict[str, Task] = {
     )
 }
 
-DSRL_FRONTIER = {
+DSRL_FRONTIER: dict[str, dict[int, float]] = {
     "BallRun": {0: 440, 20: 450, 50: 900, 80: 1300},
     "CarRun": {0: 570},
     "DroneRun": {0: 410, 50: 500, 100: 660},
