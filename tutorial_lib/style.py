@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 REWARD, COST, LIMIT, NEUTRAL = "#0072B2", "#D55E00", "#222222", "#8A8A8A"
-DASHED = {"color": LIMIT, "linestyle": (0, (4, 2)), "linewidth": 2}
+DASHED: dict[str, Any] = {"color": LIMIT, "linestyle": (0, (4, 2)), "linewidth": 2}
 STYLE: Any = {
     "font.size": 14,
     "axes.titlesize": 15,

@@ -73,7 +73,7 @@ def find_dataset(task: Task | str, source: Path | str = "shipped") -> Path:
     """The path of a task's dataset.
 
     `source` is "shipped" for the file in this project, "dsrl" for DSRL's own file, or the path of a file, or
-    of a folder with a file TASK.hdf5 (so a study can read the datasets of all its tasks there). Where the file
+    of a folder with a file TASK.hdf5 (so a study can read the datasets of all its tasks there). If the file
     is missing, no other source is tried: otherwise the same command could use different data on two machines.
     Raises DatasetError, which says where the file was expected and which command makes or downloads it.
     """
