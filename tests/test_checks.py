@@ -127,6 +127,22 @@ def least_cost(cmdp):
     return cmdp.initial @ v
 
 
+def best_for_price(cmdp, price):
+    """By value iteration."""
+    v = np.zeros(len(cmdp.initial))
+    for _ in range(600):
+        v = (cmdp.rewards - price * cmdp.costs + cmdp.gamma * cmdp.transitions @ v).max(axis=1)
+    return cmdp.initial @ v
+
+
+def without_start(cmdp, sweeps=300):
+    """One value for each state."""
+    v = np.zeros(len(cmdp.initial))
+    for _ in range(sweeps):
+        v = (cmdp.costs + cmdp.gamma * cmdp.transitions @ v).min(axis=1)
+    return v
+
+
 def implicit_policy(mu, q, v, slope):
     u = np.where(q == v, 1e-6, q - v)
     return mu * np.abs(slope(u) / u) / (mu * np.abs(slope(u) / u)).sum(-1, keepdims=True)
@@ -171,6 +187,7 @@ def budget_backup(cmdp, then, dearest=0):
 ANSWERS = {
     checks.check_run_cost: run_cost,
     checks.check_least_cost: least_cost,
+    checks.check_best_for_price: best_for_price,
     checks.check_implicit_policy: implicit_policy,
     checks.check_batched_loss: batched_loss,
     checks.check_rescaled_budget: rescaled_budget,
@@ -188,6 +205,14 @@ MISTAKES = [
     (checks.check_least_cost, lambda cmdp: cmdp.initial @ cmdp.costs.min(1), "at every step"),
     (checks.check_least_cost, lambda cmdp: cmdp.initial @ cmdp.costs.min(1) / (1 - cmdp.gamma), "look ahead"),
     (checks.check_least_cost, lambda cmdp: least_cost(cmdp) / cmdp.initial.max(), "cmdp.initial"),
+    (checks.check_least_cost, without_start, "it returns 2 numbers: average V over the start"),
+    (checks.check_least_cost, lambda cmdp: without_start(cmdp).min(), "cmdp.initial"),
+    (checks.check_least_cost, lambda cmdp: cmdp.initial @ without_start(cmdp, 40), "Iterate longer"),
+    (checks.check_best_for_price, lambda cmdp, price: best_for_price(cmdp, 0), "worth 2 - 0.5 * 1"),
+    (checks.check_best_for_price, lambda cmdp, price: best_for_price(cmdp, -price), "worth 2 - 0.5 * 1"),
+    (checks.check_best_for_price, lambda cmdp, price: max(best_for_price(cmdp, price), 0), "negative"),
+    (checks.check_best_for_price, lambda cmdp, price: best_for_price(cmdp, price) / cmdp.initial.max(),
+     "cmdp.initial"),
     (checks.check_implicit_policy, unnormalised, "divide by the sum"),
     (checks.check_implicit_policy, lambda mu, q, v, f: mu * abs(f(q - v)), "so pi_imp is mu"),
     (checks.check_implicit_policy, at_zero, "take the limit"),
@@ -205,6 +230,9 @@ MISTAKES = [
     (checks.check_keeps_limit, lambda costs, limit: np.mean(costs) < limit, "at most"),
     (checks.check_keeps_limit, lambda costs, limit: np.median(costs) <= limit, "their mean is not"),
     (checks.check_normalised_return, lambda total, task: total / task.max_return, "R_min is 0.38312"),
+    (checks.check_normalised_return, lambda R, task: np.clip(normalised_return(R, task), 0, 1), "clips"),
+    (checks.check_normalised_return, lambda R, task: min(normalised_return(R, task), 1), "clips"),
+    (checks.check_normalised_return, lambda R, task: max(normalised_return(R, task), 0), "clips"),
     (checks.check_implicit_cost_value, lambda q, v, c, k: np.where(q < v, 1 - k, k) @ c, "divide by the sum"),
     (checks.check_implicit_cost_value, lambda q, v, c, k: implicit_cost_value(v, q, c, k), "M is"),
     (checks.check_implicit_cost_value, lambda q, v, c, k: implicit_cost_value(q, v + 1e-9, c, k), "as good"),
@@ -237,6 +265,20 @@ def test_a_placeholder_and_an_error_are_told(checker, capsys):
     assert "raised ZeroDivisionError" in capsys.readouterr().out
     checker(lambda *arguments: "thirty")
     assert "= thirty, expected" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "form",
+    [
+        lambda cmdp: cmdp.initial @ without_start(cmdp, 100),  # stops 1e-4 from the end
+        lambda cmdp: cmdp.initial[None] @ without_start(cmdp),
+        lambda cmdp: torch.tensor(cmdp.initial) @ torch.tensor(without_start(cmdp)),
+        lambda cmdp: float(cmdp.initial @ without_start(cmdp)),
+    ],
+)
+def test_every_form_of_one_number_passes(form, capsys):
+    checks.check_least_cost(form)
+    assert capsys.readouterr().out.startswith("OK  ")
 
 
 # --- The symbol table of notebook 0 ---

@@ -1,12 +1,15 @@
-"""Notebook 5's figures, slider and exercises: do they show and say what is the case?"""
+"""The figures, sliders and exercises of notebooks 5 and 6 on discounted sums."""
 
+import dataclasses
 import itertools
+import math
 
 import matplotlib
 import numpy as np
 import pytest
 
 from tutorial_lib.course import checks, figures, widgets
+from tutorial_lib.tasks import TASKS
 
 
 @pytest.fixture(autouse=True)
@@ -87,6 +90,39 @@ def test_wrong_extremes_are_told(mistake, capsys):
     assert capsys.readouterr().out.startswith("NOT YET  ")
 
 
+def updates(gamma, tau, share):
+    """By a loop, where the checker has a formula."""
+    error, n = 1.0, 0
+    while error > 1 - share + 1e-12:
+        error, n = error - tau * (error - gamma * error), n + 1
+    return n
+
+
+@pytest.mark.parametrize("answer", [updates, lambda *case: float(updates(*case)),
+    lambda gamma, tau, share: math.log(1 - share) / math.log(1 - tau * (1 - gamma))])  # fmt: skip
+def test_every_form_of_the_number_of_updates_is_accepted(answer, capsys):
+    checks.check_updates_until(answer)
+    assert capsys.readouterr().out.endswith(" is right in 5 cases\n")
+
+
+@pytest.mark.parametrize(
+    ("mistake", "hint"),
+    [
+        (lambda gamma, tau, share: -math.log(1 - share) / (tau * (1 - gamma)), "the error halves"),
+        (lambda gamma, tau, share: math.log(share) / math.log(1 - tau * (1 - gamma)), "the error halves"),
+        (lambda gamma, tau, share: math.log(1 - share) / math.log(gamma), "= 0.99 at every update"),
+        (lambda gamma, tau, share: math.log10(1 - share) / math.log(1 - tau * (1 - gamma)), "halves"),
+        (lambda gamma, tau, share: None, "returns nothing"),
+        (lambda gamma, tau, share: [1, 2], "[1, 2], expected 2"),
+        (lambda gamma, tau, share: 1 / 0, "raised ZeroDivisionError"),
+    ],
+)
+def test_a_wrong_number_of_updates_gets_its_hint(mistake, hint, capsys):
+    checks.check_updates_until(mistake)
+    said = capsys.readouterr().out
+    assert said.startswith("NOT YET  ") and hint in said and said.count("\n") == 1
+
+
 # --- Figures ---
 
 
@@ -144,7 +180,29 @@ def test_long_memory_has_a_line_per_name_and_a_dot_per_mark():
     assert right.lines[-1].get_xydata().ravel() == pytest.approx([100, 1e4])
 
 
-# --- The slider ---
+def test_two_steps_end_at_the_least_and_the_largest_sum():
+    figure = figures.two_steps(head=0.8, gamma=0.5)
+    (ax,) = figure.axes
+    dots = [tuple(line.get_xydata()[0]) for line in ax.lines if len(line.get_xdata()) == 1]
+    assert dots == [pytest.approx((0.8, 0.0)), pytest.approx((0.3, 1.0))]
+    assert "0.8 and 1.3" in figure.alt_text()
+
+
+def test_extremal_sequences_are_drawn_with_their_costs():
+    """On sums of one head, whose extremes are blocks at either end."""
+    task = dataclasses.replace(TASKS["BallRun"], horizon=30, gammas=(0.8, 0.85, 0.9))
+    (ax,) = figures.extremal_sequences(task, 12, [(0,)]).axes
+    names = [label.get_text() for label in ax.get_yticklabels()]
+    heights = -np.array([bar.get_height() for bar in ax.patches if bar.get_width() == 1]).reshape(3, 30) / 0.7
+    assert names[0] == "steady: 12" and heights[0] == pytest.approx(np.full(30, 0.4))
+    for row, word in ((1, "least"), (2, "most")):
+        assert names[row] == f"1 sum, {word}: {heights[row].sum():.1f}"
+        discounted = [sum(0.8**t * c for t, c in enumerate(costs)) for costs in (heights[0], heights[row])]
+        assert discounted[0] == pytest.approx(discounted[1], abs=1e-6)
+    assert heights[1].sum() < 12 < heights[2].sum() and heights[1][0] == heights[2][-1] == pytest.approx(1)
+
+
+# --- The sliders ---
 
 
 def test_the_sliders_draw_another_picture():

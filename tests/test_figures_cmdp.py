@@ -120,3 +120,59 @@ def test_bars_are_shares_split_at_the_limit():
         assert [height for _, height in bars] == heights
         assert len({bar.get_facecolor() for bar in ax.patches}) == 2
         assert labelled(ax, "mean cost")[0, 0] == mean
+
+
+def test_the_paid_part_of_the_velocity_goes_clockwise_along_the_circle():
+    figure = figures.circle_reward()
+    (ax,) = figure.axes
+    ((place, parts),) = arrows(ax).items()
+    place, parts = np.array(place) / 1.0, sorted(map(np.array, parts), key=np.linalg.norm)
+    (ball,) = [line.get_xydata()[0] for line in ax.lines if line.get_marker() == "o"]
+    assert place == pytest.approx(ball, abs=0.5)
+    other, paid, velocity = parts
+    assert velocity == pytest.approx(other + paid, abs=0.01)
+    assert paid @ ball == pytest.approx(0, abs=0.02)
+    assert ball[1] * paid[0] - ball[0] * paid[1] > 0  # clockwise: what the reward pays for
+    assert other @ ball == pytest.approx(np.linalg.norm(other) * np.linalg.norm(ball), rel=1e-3)
+    assert "clockwise" in figure.alt_text()
+
+
+def test_mixed_ways_join_neighbours_and_mark_the_mix():
+    ways = {"dear": (3.0, 9.0), "free": (0.0, 1.0), "between": (1.0, 5.0)}
+    (ax,) = figures.mixed_ways(ways, 2.0, (2.0, 7.0)).axes
+    assert labelled(ax, "mixes of two neighbours").tolist() == [[0, 1], [1, 5], [3, 9]]
+    assert labelled(ax, "the best mix that keeps the limit").tolist() == [[2, 7]]
+    assert labelled(ax, "limit")[0, 0] == 2
+    assert {text.get_text(): text.xy for text in ax.texts} == ways
+
+
+@pytest.mark.parametrize("price", [0.2, 0.733, 1.5])
+def test_a_price_is_the_slope_of_a_line_that_touches_the_frontier(price):
+    figure = widgets.price(1.0, price)
+    left, right = figure.axes
+    line, frontier = labelled(left, "slope: the price"), labelled(left, "the best reward under each limit")
+    (x0, y0), (x1, y1) = line
+    assert (y1 - y0) / (x1 - x0) == pytest.approx(price)
+    above = y0 + price * (frontier[:, 0] - x0) - frontier[:, 1]
+    assert above.min() == pytest.approx(0, abs=2e-3)
+    curve = labelled(right, "g(price)")
+    assert np.interp(price, *curve.T) == pytest.approx(y0 + price * (1.0 - x0), abs=2e-3)
+    best = tabular.solve(tabular.shortcut(), 1.0)
+    assert curve[:, 1].min() == pytest.approx(best.reward)
+    assert curve[curve[:, 1].argmin(), 0] == pytest.approx(best.price)
+
+
+def test_limits_kept_tells_the_episodes_above_from_the_others():
+    figure = figures.limits_kept((5, 30), [[4, 5, 9], [20, 31, 33]])
+    (ax,) = figure.axes
+    dots = {label: [] for label in ("episode that kept the limit", "episode that cost more", "mean")}
+    for line in ax.lines:
+        dots[line.get_label()] += line.get_ydata().tolist()
+    assert dots == {
+        "episode that kept the limit": [4, 5, 20],
+        "episode that cost more": [9, 31, 33],
+        "mean": [6, 28],
+    }
+    dashes = [segment[0, 1] for lines in ax.collections for segment in lines.get_segments()]
+    assert dashes == [5, 30] and [tick.get_text() for tick in ax.get_xticklabels()] == ["5", "30"]
+    assert "limit 5: mean 6.0, 1 above it; limit 30: mean 28.0, 2 above it" in figure.alt_text()

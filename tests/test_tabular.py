@@ -360,3 +360,23 @@ def test_an_indicator_that_flips_for_ever_is_told():
     assert len(tabular.ciql_fixed_point(cmdp, uniform(cmdp), 0.9, 9.2)) == 4
     with pytest.raises(ArithmeticError, match="flips"):
         tabular.ciql_fixed_point(cmdp, uniform(cmdp), 0.9, 5.0)
+
+
+# --- Prices ---
+
+
+@pytest.mark.parametrize("price", [0.0, 0.4, 3.0])
+def test_the_best_policy_at_a_price_beats_every_deterministic_one(price, rng):
+    cmdp = random_cmdp(rng, states=3, actions=2, branching=2)
+    worth = [reward - price * cost for reward, cost in all_deterministic(cmdp)]
+    found = tabular.solve_priced(cmdp, price)
+    assert found.reward - price * found.cost == pytest.approx(max(worth), abs=1e-6)
+    assert found.price == price
+    for value, signal in ((found.reward, cmdp.rewards), (found.cost, cmdp.costs)):
+        assert value == pytest.approx(cmdp.initial @ iterated_values(cmdp, found.policy, signal, cmdp.gamma))
+
+
+@pytest.mark.parametrize("price", [-0.1, np.nan])
+def test_a_price_is_not_negative(price):
+    with pytest.raises(ValueError, match="at least 0"):
+        tabular.solve_priced(shortcut(), price)

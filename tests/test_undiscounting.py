@@ -7,10 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from tutorial_lib.agents import C2IQL
 from tutorial_lib.costs.reconstruction import CostReconstruction, ReconstructionConfig
 from tutorial_lib.course import undiscounting
-from tutorial_lib.data.sources import load_dataset
 from tutorial_lib.tasks import TASKS, get_task
 
 TASK = dataclasses.replace(TASKS["BallRun"], horizon=12, gammas=(0.7, 0.8, 0.9))
@@ -70,21 +68,6 @@ def test_steady_heads_are_sums_over_the_steps_that_each_treatment_sees():
         undiscounting.steady_heads(TASK, 6, "clip")
 
 
-@pytest.mark.parametrize("time_limits", ["rate", "bootstrap"])
-def test_critic_heads_are_what_the_reconstruction_is_given(time_limits):
-    """By the agent's own path: a reconstruction that hands its inputs through."""
-    config = C2IQL.configure(time_limits=time_limits, hidden_width=8, crm_width=4, crm_layers=1)
-    agent, data = C2IQL(get_task("BallRun"), config), load_dataset("BallRun")
-    found = undiscounting.critic_heads(agent, data, n=7, seed=3)
-    rows = np.random.default_rng(3).choice(len(data), 7, replace=False)
-    given = []
-    agent.reconstruction.forward = lambda heads: given.append(heads) or heads.sum(-1)
-    net = agent.networks()
-    s = agent.network_input(net, torch.tensor(data.observations[rows]), torch.full((7,), 50.0))
-    agent.episode_cost(net.cost_critics(s, torch.tensor(data.actions[rows])))
-    np.testing.assert_allclose(found, given[0][0].numpy(), rtol=1e-4)
-
-
 # --- What the heads leave open ---
 
 
@@ -133,3 +116,22 @@ def test_what_one_head_can_be_is_where_the_bounds_of_the_cost_end():
     for value, possible in ((low - 1e-3, 0), (low + 1e-3, 1), (high - 1e-3, 1), (high + 1e-3, 0)):
         moved = np.array([sums[0], value, sums[2]])
         assert np.isfinite(undiscounting.cost_bounds(moved, TASK.gammas, 12)).all() == possible
+
+
+def test_extremal_costs_have_the_heads_and_switch_between_0_and_1_at_most_m_times():
+    """A curve 1 - sum_i w_i gamma_i^t has at most m zeros, and each switch is at one of them."""
+    gammas = np.array([0.7, 0.8, 0.9])
+    for m in (1, 2, 3):
+        heads = [sum(g**t * 0.4 for t in range(12)) for g in gammas[:m]]
+        for costs, last in zip(undiscounting.extremal_costs(heads, gammas[:m], 12), (0, 1), strict=True):
+            assert [sum(costs * g ** np.arange(12)) for g in gammas[:m]] == pytest.approx(heads, abs=1e-6)
+            assert costs.min() > -1e-9 and costs.max() < 1 + 1e-9
+            between = (costs > 1e-6) & (costs < 1 - 1e-6)
+            assert between.sum() <= m
+            assert np.abs(np.diff(costs[~between].round())).sum() <= m
+            assert costs[-1] == pytest.approx(last, abs=1e-6) or between[-1]
+
+
+def test_no_sequence_no_extremal_costs():
+    least, most = undiscounting.extremal_costs([7.3], [0.9], 12)
+    assert least.shape == most.shape == (12,) and np.isnan([least, most]).all()

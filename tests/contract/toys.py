@@ -78,8 +78,8 @@ DATA = make_dataset()
 def runs_of(kind):
     """Three runs, as pairs of seed and limit: they differ in seed, or in limit if they have one.
 
-    The larger limit is ten times the horizon. An endless discounted sum of cost can be so far above that of an
-    episode (CIQL).
+    The larger limit is ten times the horizon. An endless discounted sum of cost can be so far above the cost
+    of an episode (CIQL).
     """
     return ((0, 100.0), (0, 0.0), (7, 0.0)) if kind.needs_limit else ((0, None), (3, None), (7, None))
 

@@ -12,9 +12,7 @@ import torch
 from numpy.typing import ArrayLike
 from scipy.optimize import linprog
 
-from tutorial_lib.agents import C2IQL
 from tutorial_lib.costs.reconstruction import CostReconstruction
-from tutorial_lib.data.dataset import Dataset
 from tutorial_lib.tasks import Task
 
 
@@ -59,29 +57,23 @@ def steady_heads(task: Task, cost: float, time_limits: str = "rate", step: int =
     return for_ever * (1 - gammas ** steps_seen[time_limits])
 
 
-def critic_heads(agent: C2IQL, dataset: Dataset, n: int, seed: int = 0) -> np.ndarray:
-    """The heads (n, m) that an agent's first cost critic gives to the reconstruction, for n transitions.
+def extremal_costs(heads: ArrayLike, gammas: ArrayLike, horizon: int) -> tuple[np.ndarray, np.ndarray]:
+    """The sequences of costs in [0, 1], (T,), with the least and the largest sum that have these heads, (m,).
 
-    The transitions are drawn at random from the dataset. The limit is the task's typical one, and the heads
-    are scaled as option `time_limits` says.
+    They solve two linear programmes over the feasible set of eq. 19. All their costs are NaN where no
+    sequence has these heads.
     """
-    rows = np.random.default_rng(seed).choice(len(dataset), n, replace=False)
-    limits = torch.full((n,), float(agent.task.typical_limit))
-    net = agent.networks()
-    s = agent.network_input(net, torch.tensor(dataset.observations[rows]), limits)
-    q = net.cost_critics(s, torch.tensor(dataset.actions[rows]))[0].detach().double().numpy()
-    gammas = np.asarray(agent.task.gammas)
-    return q * (1 - gammas**agent.task.horizon) if agent.config.time_limits == "rate" else q
+    powers = np.power.outer(np.asarray(gammas, float), np.arange(horizon))
+    return _extremal(np.ones(horizon), powers, heads)
 
 
 def cost_bounds(heads: ArrayLike, gammas: ArrayLike, horizon: int) -> tuple[float, float]:
     """The least and the largest undiscounted sum of T costs in [0, 1] that have these heads, (m,).
 
-    Two linear programmes over the feasible set of eq. 19. The result is (nan, nan) where no sequence has
-    these heads.
+    The result is (nan, nan) where no sequence has these heads.
     """
-    powers = np.power.outer(np.asarray(gammas, float), np.arange(horizon))
-    return _extremes(np.ones(horizon), powers, heads)
+    least, most = extremal_costs(heads, gammas, horizon)
+    return least.sum(), most.sum()
 
 
 def head_bounds(heads: ArrayLike, head: int, gammas: ArrayLike, horizon: int) -> tuple[float, float]:
@@ -91,15 +83,17 @@ def head_bounds(heads: ArrayLike, head: int, gammas: ArrayLike, horizon: int) ->
     """
     powers = np.power.outer(np.asarray(gammas, float), np.arange(horizon))
     others = np.arange(len(powers)) != head
-    return _extremes(powers[head], powers[others], np.asarray(heads)[others])
+    least, most = _extremal(powers[head], powers[others], np.asarray(heads)[others])
+    return powers[head] @ least, powers[head] @ most
 
 
-def _extremes(objective: np.ndarray, powers: np.ndarray, heads: ArrayLike) -> tuple[float, float]:
-    """The least and the largest objective @ costs, over costs (T,) in [0, 1] with powers @ costs = heads."""
+def _extremal(objective: np.ndarray, powers: np.ndarray, heads: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+    """Costs (T,) in [0, 1] with powers @ costs = heads: with the least and the largest objective @ costs."""
     # Each head is divided by its largest possible value, so that the solver's tolerance is the same for all.
     scale = powers.sum(1)
     equal = {"A_eq": powers / scale[:, None], "b_eq": np.asarray(heads) / scale, "bounds": (0, 1)}
     least, most = (linprog(sign * objective, **equal, method="highs") for sign in (1, -1))
     if least.status or most.status:
-        return np.nan, np.nan
-    return least.fun, -most.fun
+        nothing = np.full(powers.shape[1], np.nan)
+        return nothing, nothing
+    return least.x, most.x

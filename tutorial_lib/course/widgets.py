@@ -20,6 +20,7 @@ from tutorial_lib.costs.reconstruction import CostReconstruction
 from tutorial_lib.course import figures, laps
 from tutorial_lib.data.dataset import Dataset
 from tutorial_lib.playing import rollout
+from tutorial_lib.style import Picture
 from tutorial_lib.tasks import Task
 
 SLIDER = {"continuous_update": False, "style": {"description_width": "initial"}}
@@ -164,3 +165,30 @@ def print_lines(function: Callable[..., Any], first: int, last: int | None = Non
             print(inspect.cleandoc("\n" + paragraph), end="\n\n")
             return
     raise ValueError(f"no paragraph of {function.__qualname__} starts with '# {words}'")
+
+
+def price(limit: float, price: float) -> Picture:
+    """Draws a price of cost on the tabular shortcut: the slope that it means, and its bound g(price)."""
+    return figures.price_of_limit(limit, price)
+
+
+def price_slider(limit: float = 1.0, start: float = 0.2) -> Controls:
+    """`price` with a slider for the price of a unit of discounted cost. The limit stays as it is."""
+    prices = ipywidgets.FloatSlider(start, min=0, max=2, step=0.05, description="price", **SLIDER)
+    return Controls(lambda price: figures.price_of_limit(limit, price), price=prices)
+
+
+def sums_slider(task: Task, cost: float = 60, known: int = 1) -> Controls:
+    """`figures.extremal_sequences` with a slider for the steady cost and one for the number of known sums.
+
+    One sum is that of the first discount factor; two are those of the first and the last.
+    """
+    middle = range(1, len(task.gammas) - 1)
+    choices = [(0, *middle[: m - 2], -1) if m > 1 else (0,) for m in range(1, len(task.gammas) + 1)]
+    costs = ipywidgets.IntSlider(cost, 5, int(task.cost_range), 5, description="unsafe steps", **SLIDER)
+    counts = ipywidgets.IntSlider(known, 1, len(choices), description="known sums", **SLIDER)
+    return Controls(
+        lambda cost, known: figures.extremal_sequences(task, cost, [choices[known - 1]]),
+        cost=costs,
+        known=counts,
+    )

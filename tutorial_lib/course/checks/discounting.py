@@ -1,5 +1,7 @@
 """This module checks the answers to the exercises of notebook 5."""
 
+import functools
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -84,3 +86,29 @@ def check_extremes(answer: Callable) -> None:
         most = int(np.sum(np.cumsum(powers[::-1]) <= mark))
         cases.append(((horizon, gamma, limit), (fewest, most), hint))
     try_answer(answer, cases)
+
+
+def check_updates_until(answer: Callable) -> None:
+    """Checks an exercise of notebook 5.
+
+    `answer(gamma, tau, share)` is the number of updates after which a critic that starts at zero has `share`
+    of its value. Rounded numbers are accepted, too.
+    """
+    hints = {
+        (0.5, 1.0, 0.75): "with tau = 1 the error halves at every update: 1, 1/2, 1/4",
+        (0.9, 0.1, 0.5): "the error is multiplied by 1 - tau (1 - gamma) = 0.99 at every update",
+        (0.5, 0.5, 0.99): "solve (1 - tau (1 - gamma))^n = 1 - share for n, without an approximation",
+        (0.99, 0.005, 0.99): "the paper's smallest gamma on CarCircle, with IQL's tau",
+        (0.999, 0.005, 0.99): "ten times the horizon needs ten times the updates",
+    }
+    exact = {case: math.log(1 - case[2]) / math.log(1 - case[1] * (1 - case[0])) for case in hints}
+
+    @functools.wraps(answer)
+    def unrounded(*arguments):
+        got, right = answer(*arguments), exact[arguments]
+        try:
+            return right if any(abs(float(got) - n) < 1e-6 for n in (round(right), math.ceil(right))) else got
+        except (TypeError, ValueError):  # `got` is not a number
+            return got
+
+    try_answer(unrounded, [(case, exact[case], hint) for case, hint in hints.items()])

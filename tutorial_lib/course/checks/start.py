@@ -74,8 +74,15 @@ def check_normalised_return(answer: Callable) -> None:
     `answer(total, task)` returns DSRL's normalised return. The task's record holds the reference returns.
     """
     cases = []
-    for name, total in (("BallCircle", 0.38312), ("BallCircle", 600.0), ("CarRun", 574.6533)):
+    outside = ", and nothing clips the result to [0, 1]: the two returns are references, not bounds"
+    for name, total, more in (
+        ("BallCircle", 0.38312, ""),
+        ("BallCircle", 600.0, ""),
+        ("CarRun", 574.6533, ""),
+        ("BallCircle", 950.0, outside),
+        ("CarRun", 100.0, outside),
+    ):
         task = get_task(name)
-        hint = f"(R - R_min) / (R_max - R_min), and {name}'s R_min is {task.min_return:g}"
+        hint = f"(R - R_min) / (R_max - R_min), and {name}'s R_min is {task.min_return:g}{more}"
         cases.append(((total, task), float(normalised_return(total, task)), hint))
     try_answer(answer, cases)

@@ -1,20 +1,25 @@
-"""The figures of discounted costs: timelines, Fig. 1, and the updates that a large gamma needs."""
+"""The figures of discounted costs: timelines, Fig. 1, the updates that a large gamma needs, and the
+sequences of costs that a few discounted sums allow.
+"""
 
 import numpy as np
 from matplotlib.colors import to_rgba
 
 from tutorial_lib.costs.discounting import average_threshold, discounted_sums, misjudged
+from tutorial_lib.course.undiscounting import extremal_costs
 from tutorial_lib.style import (
     COST,
     DASHED,
     LIMIT,
     NEUTRAL,
     REWARD,
+    described,
     legend_below,
     one_figure,
     subplots,
     task_panels,
 )
+from tutorial_lib.tasks import Task
 
 FALSE_POSITIVE, FALSE_NEGATIVE = "safe, but rejected", "unsafe, but accepted"
 COLOURS = {FALSE_POSITIVE: REWARD, FALSE_NEGATIVE: COST}
@@ -50,7 +55,9 @@ def timelines(costs, gamma: float, limit: float, names=None):
     steps.spines["left"].set_visible(False)
     steps.tick_params(axis="y", length=0)
     legend_below(figure, bars)
-    return figure
+    rows = zip(names, *ratios.values(), strict=True)
+    words = "; ".join(f"{name}: cost {a:.2f}, discounted cost {b:.2f} of its limit" for name, a, b in rows)
+    return described(figure, f"The unsafe steps of {count} episodes as coloured marks. {words}.")
 
 
 def _draw_steps(ax, row: int, costs, gamma: float):
@@ -90,7 +97,11 @@ def falling_cost(gamma: float, start: int, horizon: int = 301, limit: float = 50
     below.set(xlabel="step at which the block starts", ylabel=r"$\tilde C\,/\,\tilde L$", ylim=(0, None))
     below.set_xlim(0, horizon)
     legend_below(figure, above, below)
-    return figure
+    text = (
+        f"Two blocks of {lengths[0]} and {lengths[1]} unsafe steps and the weights of the steps for gamma ="
+        f" {gamma:g}. Below, their discounted cost for every start: it falls as the block starts later."
+    )
+    return described(figure, text)
 
 
 @one_figure
@@ -106,7 +117,12 @@ def mismatch(panels, ylabel: str = r"discounted cost $\tilde C$"):
     for ax in axes[:, 0]:
         ax.set_ylabel(ylabel)
     legend_below(figure, axes[0, 0])
-    return figure
+    shares = [
+        f"{title}: {misjudged(*panel).false_positives:.1%} safe but rejected, "
+        f"{misjudged(*panel).false_negatives:.1%} unsafe but accepted"
+        for title, panel in panels.items()
+    ]
+    return described(figure, f"A dot per sequence, at its cost and the estimate. {'; '.join(shares)}.")
 
 
 def _draw_mismatch(ax, title, cost, estimate, limit, mark):
@@ -147,7 +163,7 @@ def misjudged_shares(counts):
     for ax in axes[:, 0]:
         ax.set_ylabel("% of the episodes")
     legend_below(figure, axes[0, 0])
-    return figure
+    return described(figure, "Bars: the share of each task's episodes that eq. 2 misjudges, at each limit.")
 
 
 @one_figure
@@ -174,4 +190,65 @@ def long_memory(gammas, shares, updates, marked=(), available: float = 400_000):
     )
     right.set(xscale="log", yscale="log", xlabel=r"horizon $1 / (1 - \gamma)$ in steps", ylabel="updates")
     legend_below(figure, left, right)
-    return figure
+    text = (
+        "Left: the share of misjudged sequences falls to almost zero as the horizon 1 / (1 - gamma) grows."
+        f" Right: the updates until a critic has settled grow with it, and pass {available:,.0f}."
+    )
+    return described(figure, text)
+
+
+@one_figure
+def two_steps(head: float, gamma: float):
+    """Draws all pairs of costs in [0, 1] with the discounted sum `head`, as a line in the unit square.
+
+    The two ends of the line have the least and the largest undiscounted sum. Grey lines join pairs with the
+    same undiscounted sum.
+    """
+    least, most = extremal_costs([head], [gamma], 2)
+    figure, ax = subplots(figsize=(8, 5.4))
+    ax.fill([0, 1, 1, 0], [0, 0, 1, 1], color=NEUTRAL, alpha=0.12, label="costs between 0 and 1")
+    ax.plot(*zip(least, most, strict=True), color=COST, linewidth=5, label=f"discounted sum {head:g}")
+    for costs, word in ((least, "least"), (most, "largest")):
+        total = costs.sum()
+        ends = np.clip([total - 1, total], 0, 1)
+        ax.plot(ends, total - ends, color=NEUTRAL, linestyle="--", linewidth=1.5)
+        ax.plot(*costs, "o", color=LIMIT, markersize=12, clip_on=False, zorder=5)
+        place = {"xytext": (12, 10), "textcoords": "offset points"}
+        ax.annotate(f"{word} sum {total:.3g}", costs, **place)
+    ax.plot([], [], color=NEUTRAL, linestyle="--", linewidth=1.5, label="same undiscounted sum")
+    ax.set(xlabel="cost $c_0$", ylabel="cost $c_1$", xlim=(0, 1.25), ylim=(0, 1.15), aspect="equal")
+    ax.set(xticks=(0, 0.5, 1), yticks=(0, 0.5, 1))
+    legend_below(figure, ax)
+    text = (
+        f"The unit square of two costs. A line holds the pairs whose discounted sum is {head:g}. At its ends"
+        f" the undiscounted sum is {least.sum():.3g} and {most.sum():.3g}."
+    )
+    return described(figure, text)
+
+
+@one_figure
+def extremal_sequences(task: Task, cost: float, known=((0,), (0, 2), (0, 1, 2))):
+    """Draws the cheapest and the dearest sequence that share discounted sums with a steady cost.
+
+    `cost` is the undiscounted sum of the steady cost, in unsafe steps. Each element of `known` lists the
+    indices of the discount factors whose sums are known, and has two rows in the figure.
+    """
+    steady, gammas = np.full(task.horizon, cost / task.horizon), np.asarray(task.gammas)
+    rows = [(f"steady: {cost:g}", steady, NEUTRAL)]
+    for heads in map(list, known):
+        sums = f"{len(heads)} sum" + "s" * (len(heads) > 1)
+        found = extremal_costs(discounted_sums(steady, gammas[heads]), gammas[heads], task.horizon)
+        for word, costs, colour in zip(("least", "most"), found, (REWARD, COST), strict=True):
+            rows.append((f"{sums}, {word}: {costs.sum():.1f}", costs, colour))
+    figure, ax = subplots(figsize=(12, 1.6 + 0.62 * len(rows)))
+    for row, (_, costs, colour) in enumerate(rows):
+        ax.barh(row, task.horizon, 0.7, color=NEUTRAL, alpha=0.12)
+        ax.bar(np.arange(task.horizon) + 0.5, -0.7 * costs, 1.0, row + 0.35, color=colour)
+    ax.set_yticks(range(len(rows)), [name for name, *_ in rows])
+    ax.set(xlabel="step (the height of a bar is the cost of the step)", xlim=(0, task.horizon))
+    ax.set_ylim(len(rows) - 0.5, -0.5)
+    ax.tick_params(axis="y", length=0)
+    words = "; ".join(name for name, *_ in rows)
+    return described(
+        figure, f"Cost sequences with equal discounted sums, on {task.name}. {words} unsafe steps."
+    )

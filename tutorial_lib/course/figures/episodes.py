@@ -10,7 +10,9 @@ from tutorial_lib.style import (
     DASHED,
     LIMIT,
     NEUTRAL,
+    REWARD,
     Picture,
+    described,
     legend_below,
     one_figure,
     subplots,
@@ -75,7 +77,11 @@ def robot_at_limits(agent, limits=None, seed: int = 10):
         ax.set_xlabel(_summary(played, e, "took {cost:.0f}, return {total:.0f}"))
         ax.set(xticks=[], yticks=[])
         ax.spines[:].set_visible(False)
-    return figure
+    words = "; ".join(f"{ax.get_title()}: {ax.get_xlabel()}" for ax in axes[0])
+    return described(
+        figure,
+        f"{task.name}: the robot at several steps of an episode, in one image for each limit. {words}.",
+    )
 
 
 @one_figure
@@ -88,6 +94,34 @@ def frames_strip(frames, costs, steps, limit: float):
         ax.set_xlabel(f"cost {cost:.0f} of {limit:g}", color=COST)
         ax.spines[:].set_visible(False)
     return figure
+
+
+# --- Limits ---
+
+
+@one_figure
+def limits_kept(limits, costs):
+    """Draws the cost of every episode, and their mean, beside the limit under which they were played.
+
+    `limits` are (n,) and `costs` (n, episodes). Both are unsafe steps per episode.
+    """
+    limits, costs = np.asarray(limits, float), np.asarray(costs, float)
+    figure, ax = subplots(figsize=(9, 5))
+    spread = np.linspace(-0.18, 0.18, costs.shape[1])
+    for x, (limit, paid) in enumerate(zip(limits, costs, strict=True)):
+        ax.hlines(limit, x - 0.32, x + 0.32, **DASHED, label="limit")
+        for above, colour, words in ((False, NEUTRAL, "kept the limit"), (True, COST, "cost more")):
+            here = (paid > limit) == above
+            label = f"episode that {words}"
+            ax.plot(x + spread[here], paid[here], "o", color=colour, markersize=7, alpha=0.75, label=label)
+        ax.plot(x, paid.mean(), "D", color=REWARD, markersize=11, label="mean", zorder=4)
+    ax.set(xticks=range(len(limits)), xticklabels=[f"{limit:g}" for limit in limits])
+    ax.set(xlabel="limit named by the user", ylabel="unsafe steps of an episode")
+    ax.set_ylim(0, 1.08 * max(limits.max(), costs.max()))
+    legend_below(figure, ax)
+    found = zip(limits, costs.mean(1), (costs > limits[:, None]).sum(1), strict=True)
+    words = "; ".join(f"limit {limit:g}: mean {mean:.1f}, {more} above it" for limit, mean, more in found)
+    return described(figure, f"The costs of {costs.shape[1]} episodes under each limit. {words}.")
 
 
 # --- Episodes ---

@@ -7,7 +7,17 @@ import torch
 from matplotlib import ticker
 
 from tutorial_lib.course.undiscounting import cost_bounds, head_bounds, steady_heads, weight_curve
-from tutorial_lib.style import COST, DASHED, LIMIT, NEUTRAL, REWARD, legend_below, one_figure, subplots
+from tutorial_lib.style import (
+    COST,
+    DASHED,
+    LIMIT,
+    NEUTRAL,
+    REWARD,
+    described,
+    legend_below,
+    one_figure,
+    subplots,
+)
 from tutorial_lib.tasks import Task
 
 GREEN, PURPLE = "#009E73", "#CC79A7"  # These are two more colours of Okabe and Ito.
@@ -32,38 +42,84 @@ def flat_curve(weights, gammas, horizon: int):
     for ax in (parts, whole):
         ax.axvspan(horizon, steps, color=NEUTRAL, alpha=0.2, linewidth=0, label="beyond the time limit")
         ax.set(xlabel="step", xlim=(0, steps))
-    parts.set_ylabel("what a cost of 1 counts")
+    parts.set_ylabel("weight of a cost in the sum")
     legend_below(figure, parts, whole)
-    return figure
+    text = (
+        "Left: falling curves with weights of alternating sign. Right: their sum stays near 1 up to step"
+        f" {horizon}, and is far from zero beyond it."
+    )
+    return described(figure, text)
+
+
+@one_figure
+def weight_curves(curves: dict, horizon: int):
+    """Draws the weight of a cost at each step, with one line per name of `curves`, and the line at 1.
+
+    Each curve is (steps,), and the steps beyond the time limit are grey.
+    """
+    figure, ax = subplots(figsize=(12, 4.8))
+    styles = ((REWARD, "-"), (COST, "--"), (GREEN, "-."), (PURPLE, ":"))
+    for (name, curve), (colour, style) in zip(curves.items(), styles, strict=False):
+        ax.plot(curve, style, color=colour, label=name)
+    steps = max(map(len, curves.values()))
+    ax.axhline(1, **DASHED, label="undiscounted")
+    if steps > horizon:
+        ax.axvspan(horizon, steps, color=NEUTRAL, alpha=0.2, linewidth=0, label="beyond the time limit")
+    ax.set(xlabel="step", ylabel="weight of a cost in the sum", xlim=(0, steps))
+    legend_below(figure, ax)
+    ends = "; ".join(f"{name}: from {c[0]:.2f} to {c[horizon - 1]:.2f}" for name, c in curves.items())
+    return described(figure, f"The weight of a cost over the steps of an episode. {ends}.")
+
+
+@one_figure
+def table2(noises, curves: dict):
+    """Draws training losses (MSE) over the noise on the inputs, with one line per name of `curves`.
+
+    The first line is the paper's. The noise 0 stands at the left end of the logarithmic axis.
+    """
+    figure, ax = subplots(figsize=(12, 5))
+    place = np.where(np.asarray(noises) == 0, 0.05, noises)
+    styles = zip((LIMIT, REWARD, COST, GREEN), ("-o", "--s", "-.^", ":D"), strict=True)
+    for (name, losses), (colour, style) in zip(curves.items(), styles, strict=False):
+        ax.plot(place, losses, style, color=colour, markersize=8, label=name)
+    ax.set(xscale="log", yscale="log", xlabel="noise on the inputs (standard deviation)")
+    ax.set_ylabel("MSE (squared unsafe steps)")
+    ax.set_xticks(place, [f"{noise:g}" for noise in noises])
+    ax.xaxis.set_minor_locator(ticker.NullLocator())
+    legend_below(figure, ax)
+    ends = "; ".join(f"{name}: from {v[0]:.2g} to {v[-1]:.3g}" for name, v in curves.items())
+    return described(figure, f"Training losses over the noise on the inputs. {ends}.")
 
 
 @one_figure
 def model_sizes(table, trained: dict):
-    """Draws the error over the model size, with one panel per test noise and one line per training noise.
+    """Draws the error of each model size, with one panel per test noise and one marker per training noise.
 
     `table` is the table of `reconstruction_study`. `trained` maps the name of a training noise to its (noise,
-    noise_rate). Each dot is the error on random sequences. The linear model is at the left.
+    noise_rate). Each marker is the error on random sequences. All panels have the same scale.
     """
     tests = {"clean inputs": (0.0, 0.0), "noise 0.1": (0.1, 0.0), "0.01 cost per step": (0.0, 0.01)}
-    figure, axes = subplots(1, len(tests), figsize=(12, 4.8))
+    figure, axes = subplots(1, len(tests), figsize=(12, 5.2), sharey=True)
     sizes = list(dict.fromkeys(table["size"]))
     for ax, (title, (noise, rate)) in zip(axes, tests.items(), strict=True):
         part = table[(table["test_noise"] == noise) & (table["test_noise_rate"] == rate)]
-        for (name, (own, own_rate)), style, colour in zip(
-            trained.items(), ("-", "--", ":"), (REWARD, COST, GREEN), strict=False
+        for shift, (name, (own, own_rate)), marker, colour in zip(
+            (-0.2, 0, 0.2), trained.items(), "o^s", (REWARD, COST, GREEN), strict=False
         ):
-            line = part[(part["noise"] == own) & (part["noise_rate"] == own_rate)].set_index("size")
-            errors = line["rmse_random"].reindex(sizes)
-            ax.plot(range(len(sizes)), errors, style, marker="o", markersize=8, color=colour, label=name)
+            found = part[(part["noise"] == own) & (part["noise_rate"] == own_rate)].set_index("size")
+            errors = found["rmse_random"].reindex(sizes)
+            style = {"linestyle": "", "marker": marker, "markersize": 10, "color": colour}
+            ax.plot(np.arange(len(sizes)) + shift, errors, label=f"trained on {name}", **style)
         ax.set_xticks(range(len(sizes)), [size.replace(" ", "") for size in sizes], rotation=45)
-        ax.set(title=f"tested on {title}", yscale="log")
-        low, high = ax.get_ylim()
-        ticks = [tick for tick in (0.2, 0.5, 1, 2, 5, 10, 20, 50, 100) if low <= tick <= high]
-        ax.set_yticks(ticks, [f"{tick:g}" for tick in ticks])
+        ax.set(title=f"tested on\n{title}", yscale="log")
+        ax.grid(axis="y", color=NEUTRAL, alpha=0.3)
+        ax.set_yticks((0.5, 1, 2, 5, 10, 20, 50, 100), ("0.5", "1", "2", "5", "10", "20", "50", "100"))
         ax.yaxis.set_minor_locator(ticker.NullLocator())
     axes[0].set_ylabel("error in unsafe steps (RMS)")
     legend_below(figure, axes[0])
-    return figure
+    return described(
+        figure, "The error of five model sizes, trained on three kinds of noise, tested on each."
+    )
 
 
 @one_figure
@@ -84,7 +140,10 @@ def time_limits(ratios):
     ax.set_xticks(range(len(ratios)), ratios, rotation=20)
     ax.set(ylabel="reconstructed / true cost")
     legend_below(figure, ax)
-    return figure
+    means = [f"{word}: {np.mean([r[word] for r in ratios.values()]):.2f}" for word in words]
+    return described(
+        figure, f"Reconstructed cost divided by the true cost, mean of tasks. {'; '.join(means)}."
+    )
 
 
 @one_figure
@@ -93,15 +152,41 @@ def settling(updates, curves, truth: float):
 
     The dashed line is the true cost.
     """
-    figure, ax = subplots(figsize=(11, 4.6))
+    figure, ax = subplots(figsize=(12, 5.2))
     styles = zip(("-", "--", ":", "-."), (REWARD, COST, GREEN, PURPLE), strict=True)
     for (name, values), (style, colour) in zip(curves.items(), styles, strict=False):
         ax.plot(updates, values, style, color=colour, label=name)
     ax.axhline(truth, **DASHED, label="the truth")
-    ax.set(xlabel="updates", ylabel="unsafe steps", xlim=(0, max(updates)), ylim=(0, None))
+    ax.set(xlabel="updates", ylabel="reconstructed cost (unsafe steps)", xlim=(0, max(updates)))
     ax.xaxis.set_major_formatter("{x:,.0f}")
     legend_below(figure, ax)
-    return figure
+    ends = "; ".join(f"{name}: from {v[0]:.0f} to {v[-1]:.0f}" for name, v in curves.items())
+    return described(figure, f"The reconstructed cost over the updates. {ends}; truth {truth:g}.")
+
+
+@one_figure
+def met_by_critics(answers: dict, truth: float):
+    """Draws a histogram of the costs that each model reconstructs from a critic's heads, one panel per model.
+
+    `answers` maps a name to costs (n,). The dashed line is the mean cost of a recorded episode.
+    """
+    figure, axes = subplots(
+        len(answers), 1, figsize=(12, 1.3 + 1.9 * len(answers)), sharex=True, squeeze=False
+    )
+    low = min(-20.0, *(np.quantile(costs, 0.02) for costs in answers.values()))
+    high = max(2 * truth, *(np.quantile(costs, 0.98) for costs in answers.values()))
+    for ax, (name, costs), colour in zip(axes[:, 0], answers.items(), (REWARD, COST, GREEN), strict=False):
+        ax.hist(np.clip(costs, low, high), np.linspace(low, high, 60), color=colour, alpha=0.8)
+        ax.axvline(truth, **DASHED, label="mean cost of a recorded episode")
+        ax.set_title(
+            f"{name}: mean {np.mean(costs):.0f}, standard deviation {np.std(costs):.0f}", fontsize=14
+        )
+        ax.set_yticks([])
+        ax.spines["left"].set_visible(False)
+    axes[-1, 0].set_xlabel("reconstructed cost of an episode (unsafe steps)")
+    legend_below(figure, axes[0, 0])
+    words = "; ".join(f"{n}: mean {np.mean(c):.0f}, deviation {np.std(c):.0f}" for n, c in answers.items())
+    return described(figure, f"Histograms of costs reconstructed from a critic. {words}; truth {truth:.0f}.")
 
 
 @one_figure
@@ -136,7 +221,11 @@ def head_error(models, task: Task, head: int, error: float, cost: float = 60):
     right.axhline(cost, **DASHED, label="the truth")
     right.set(xlabel=f"error in head {head}", ylabel="reconstructed cost", xlim=(-2, 2))
     legend_below(figure, left, right)
-    return figure
+    text = (
+        f"Left: the heads, with head {head} off by {error:+.2f}. Right: the reconstructed cost over that"
+        f" error, for each model. Some sequence has such heads for errors from {low:.2f} to {high:.2f} alone."
+    )
+    return described(figure, text)
 
 
 def _answers(model, heads):

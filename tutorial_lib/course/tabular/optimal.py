@@ -38,6 +38,18 @@ def least_cost(cmdp: CMDP) -> float:
     return solve(dataclasses.replace(cmdp, rewards=-cmdp.costs)).cost
 
 
+def solve_priced(cmdp: CMDP, price: float) -> Solution:
+    """The best policy where each unit of discounted cost costs `price` >= 0 of reward, and no limit is set.
+
+    It maximises R - price * C, which is the Lagrangian of eq. 2 without its constant price * limit. The
+    solution has the policy's own reward R and cost C. Raises ValueError for a price that is negative or NaN.
+    """
+    if not price >= 0:
+        raise ValueError(f"the price of a limit is at least 0, not {price}")
+    found = solve(dataclasses.replace(cmdp, rewards=cmdp.rewards - price * cmdp.costs))
+    return found._replace(reward=float((found.occupancy * cmdp.rewards).sum()), price=price)
+
+
 def solve_episodes(cmdp: CMDP, horizon: int, limit: float = np.inf) -> Solution:
     """The solution of eq. 1: the largest expected return of T = `horizon` steps under a limit.
 
