@@ -32,7 +32,7 @@ function blocksOf(slide) {
     if (markdown && cell.classList.contains("jp-MarkdownCell")) {
       step += 1;
       if (markdown.classList.contains("celltag_answer")) {
-        for (const node of answerOf(markdown)) blocks.push({ node, step, fresh: node.tagName === "H3" });
+        for (const node of answerOf(markdown)) blocks.push({ node, step, answer: true, fresh: node.tagName === "H3" });
         continue;
       }
       for (const node of [...markdown.children]) {
@@ -51,7 +51,7 @@ function blocksOf(slide) {
       for (const node of parts) blocks.push({ node, step });
     }
   }
-  if (blocks.length) blocks[0].fresh = true;
+  blocks.forEach((block, n) => { block.fresh ||= n === 0 || (blocks[n - 1].answer && !block.answer); });
   return blocks;
 }
 
