@@ -163,7 +163,9 @@ def test_every_algorithm_is_timed_as_it_trains():
                 same.update(same.draw_all(watch.data, generators))
         for key, value in same.state().items():
             # FISOR's policy has no gradient where no action is feasible, and Adam takes rounding for one.
-            close = {"rtol": 1e-4, "atol": 1e-3 if key.startswith("online.policy.blocks") else 1e-5}
+            # Elsewhere, a number can be off by rounding of the largest numbers that it is a sum of.
+            largest = max(1.0, value.abs().max().item())
+            close = {"rtol": 1e-4, "atol": 1e-3 if key.startswith("online.policy.blocks") else 1e-5 * largest}
             torch.testing.assert_close(agent.state()[key], value, msg=f"{name}: {key}", **close)
 
 
