@@ -224,6 +224,8 @@ MISTAKES = [
     (checks.check_rescaled_budget, lambda L, spent, t, T: L * T / (T - t), "on schedule"),
     (checks.check_rescaled_budget, lambda L, spent, t, T: max(L - spent, 0) * T / (T - t), "overspent"),
     (checks.check_budget_backup, lambda cmdp, then: budget_backup(cmdp, then, 1), "then[b - c]"),
+    (checks.check_budget_backup, lambda cmdp, then: budget_backup(cmdp, then).clip(min=0), "can be negative"),
+    (checks.check_budget_backup, lambda cmdp, then: budget_backup(cmdp, cmdp.gamma * then), "discount"),
     (checks.check_budget_backup, lambda cmdp, then: (cmdp.rewards + cmdp.transitions @ then[0]).max(1)[None],
      "without a budget"),
     (checks.check_keeps_limit, lambda costs, limit: max(costs) <= limit, "expectation"),

@@ -76,6 +76,69 @@ def test_what_is_told_by_hand():
     assert math.isinf(covered[80, 0]) and covered[79, 0] == 40
 
 
+def best_with_payments(cmdp, state, steps, budget, price):
+    """`tabular.plan_budget`, action by action: a plain recursion over every future."""
+    if steps == 0:
+        return 0.0
+    found = []
+    for a, cost in enumerate(cmdp.costs[state]):
+        left = max(budget - cost, 0)
+        later = [p * best_with_payments(cmdp, z, steps - 1, left, price)
+                 for z, p in enumerate(cmdp.transitions[state, a]) if p > 0]  # fmt: skip
+        found.append(cmdp.rewards[state, a] - price * max(cost - budget, 0) + sum(later))
+    return max(found)
+
+
+@pytest.mark.parametrize("seed, price", [(0, 0.3), (1, 2.0), (2, 0.0)])
+def test_the_plan_against_every_future(seed, price):
+    cmdp = tabular.random_cmdp(np.random.default_rng(seed), states=4, branching=2)
+    cmdp.costs[1] = 1, 1, 2  # a state that costs whatever one does
+    cmdp.rewards[2] -= 1
+    values, actions = tabular.plan_budget(cmdp, 4, 2, price)
+    assert values.shape == (5, 3, 4) and actions.shape == (4, 3, 4)
+    for budget in range(3):
+        for state in range(4):
+            expected = best_with_payments(cmdp, state, 4, budget, price)
+            assert values[0, budget, state] == pytest.approx(expected)
+    cmdp.costs[:] /= 2
+    with pytest.raises(ValueError, match="whole costs"):
+        tabular.plan_budget(cmdp, 4, 2, price)
+
+
+@pytest.mark.parametrize("clock", [True, False])
+def test_the_planning_agent_agrees_with_played_episodes(clock):
+    """A loop over steps that looks its actions up for each episode, with words of its own for eq. 23."""
+    rng, cmdp, n, limit = np.random.default_rng(2), tabular.laps(), 4000, 10
+    found = laps.follow_plan(limit, price=0.7, clock=clock)
+    _, actions = tabular.plan_budget(cmdp, 100, 60, 0.7)
+    state = draw(np.tile(cmdp.initial, (n, 1)), rng)
+    spent, earned = np.zeros((2, n))
+    for t in range(100):
+        left = np.maximum(limit - spent, 0)
+        told = np.minimum(np.round(left * 100 / (100 - t)), 60).astype(int)
+        action = actions[t, left.astype(int), state] if clock else actions[0, told, state]
+        spent, earned = spent + cmdp.costs[state, action], earned + cmdp.rewards[state, action]
+        state = draw(cmdp.transitions[state, action], rng)
+    assert found.cost == pytest.approx(spent.mean(), abs=5 * spent.std() / n**0.5)
+    assert found.reward == pytest.approx(earned.mean(), abs=5 * earned.std() / n**0.5)
+    assert found.exceeds(limit) == pytest.approx((spent > limit).mean(), abs=0.04)
+
+
+def test_an_agent_with_every_rate_agrees_with_played_episodes():
+    rng, cmdp, n, limit = np.random.default_rng(3), tabular.laps(), 4000, 10
+    agent = laps.policies(range(61))
+    state = draw(np.tile(cmdp.initial, (n, 1)), rng)
+    spent, earned = np.zeros((2, n))
+    for t in range(100):
+        told = np.clip(np.round((limit - spent) * 100 / (100 - t)), 0, 60)
+        action = draw(np.stack([agent[b][s] for b, s in zip(told, state, strict=True)]), rng)
+        spent, earned = spent + cmdp.costs[state, action], earned + cmdp.rewards[state, action]
+        state = draw(cmdp.transitions[state, action], rng)
+    found = laps.follow_any_rate(limit)
+    assert found.cost == pytest.approx(spent.mean(), abs=5 * spent.std() / n**0.5)
+    assert found.reward == pytest.approx(earned.mean(), abs=5 * earned.std() / n**0.5)
+
+
 def test_a_biased_agent_pays_in_proportion():
     for bias in (0.6, 1.6):
         agent = laps.policies((25,), bias)

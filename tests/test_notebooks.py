@@ -12,6 +12,7 @@ from pkgutil import resolve_name
 import nbformat
 import pandas as pd
 import pytest
+from marks import is_answer, remove_marks
 
 from tutorial_lib.agents import ALGORITHMS
 from tutorial_lib.studies import report, results
@@ -62,6 +63,88 @@ def test_stores_no_trace_of_the_machine(notebook):
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_is_small(path):
     assert path.stat().st_size < 500_000
+
+
+GRADE = re.compile(r"^\*Grade: (check|derive|research)\. Objectives?: ([\d, and]+)\.\*$", re.MULTILINE)
+ANSWER = re.compile(r"<details>\n<summary>Answer</summary>\n\n.+\n\n</details>", re.DOTALL)
+
+
+@pytest.fixture
+def lesson(notebook):
+    """A notebook of the second edition; skips one of the first, which has no answers."""
+    if not any(is_answer(cell) for cell in notebook.cells):
+        pytest.skip("first edition: no cell is tagged 'answer'")
+    return notebook
+
+
+def _prose(notebook):
+    return "\n\n".join(cell.source for cell in notebook.cells if cell.cell_type == "markdown")
+
+
+def test_every_objective_is_met_by_an_exercise(lesson):
+    objectives = re.findall(r"^(\d+)\. ", lesson.cells[0].source, re.MULTILINE)
+    met = [number for _, named in GRADE.findall(_prose(lesson)) for number in re.findall(r"\d+", named)]
+    assert objectives == [str(n + 1) for n in range(len(objectives))] and len(objectives) >= 2
+    assert set(met) == set(objectives)
+
+
+def test_every_exercise_has_a_grade_and_one_is_open_ended(lesson):
+    headings = re.findall(r"^## Exercise (\d+): .+\n(?:\n)?(.*)$", _prose(lesson), re.MULTILINE)
+    assert [int(number) for number, _ in headings] == list(range(1, len(headings) + 1))
+    grades = [GRADE.fullmatch(line) for _, line in headings]
+    assert all(grades), "under an exercise's heading: *Grade: check. Objective: 2.*"
+    assert "research" in [grade[1] for grade in grades]
+
+
+def test_every_prediction_is_answered_before_the_next(lesson):
+    """`open_since` is the cell with a question that no answer has followed yet."""
+    open_since = None
+    for number, cell in enumerate(lesson.cells):
+        if is_answer(cell):
+            open_since = None
+        elif cell.cell_type == "markdown":
+            for _ in re.findall(r"^\*\*Predict\.\*\*", cell.source, re.MULTILINE):
+                assert open_since is None, f"cell {open_since} asks and is not answered before cell {number}"
+                open_since = number
+    assert open_since is None, f"cell {open_since} asks and is not answered"
+
+
+def test_answers_can_be_folded(lesson):
+    for cell in lesson.cells:
+        if is_answer(cell):
+            assert ANSWER.fullmatch(cell.source.rstrip()), cell.source[:80]
+        else:
+            assert "<details" not in cell.source
+
+
+def test_a_measured_value_or_a_claim_is_checked(lesson):
+    checked = [cell for cell in _code(lesson) if "# NBVAL_CHECK_OUTPUT" in cell.source]
+    printed = "".join(output.get("text", "") for cell in checked for output in cell.outputs)
+    claims = any("checks.check_that(" in cell.source for cell in checked)
+    assert claims or re.search(r"^OK  .*: found ", printed, re.MULTILINE)
+
+
+def test_leads_on_to_further_reading(lesson):
+    reading = re.split(r"^#+ Further reading.*$", _prose(lesson), flags=re.MULTILINE)
+    assert len(reading) == 2, "one heading '## Further reading'"
+    assert len(set(re.findall(r"\]\((https?://[^)]+)\)", reading[1]))) >= 2
+
+
+def test_code_can_be_read_at_a_glance(lesson):
+    remove_marks(lesson)
+    long = {cell.source.count("\n") + 1: cell.source for cell in _code(lesson)}
+    assert max(long) <= 25, long[max(long)]
+
+
+def test_every_figure_says_what_it_shows(lesson):
+    figures = [output for output in _outputs(lesson) if "image/png" in output.get("data", {})]
+    texts = [output.metadata.get("image/png", {}).get("alt", "") for output in figures]
+    assert texts and all(len(text.split()) >= 3 for text in texts), "use style.described(figure, ...)"
+
+
+def test_shows_the_map_of_the_method_and_the_time_it_takes(lesson):
+    assert any("figures.method_map(" in cell.source for cell in _code(lesson))
+    assert re.search(r"\*\*Time:\*\*[^.]*minutes?", lesson.cells[0].source)
 
 
 def _read(start):

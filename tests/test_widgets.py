@@ -83,3 +83,36 @@ def test_penalty_sliders_draw_a_limit_and_an_expectile():
 def test_lines_that_no_comment_names_are_an_error():
     with pytest.raises(ValueError, match="Lines 1-2"):
         widgets.print_lines(C2IQL.losses, 1, 2)
+
+
+def test_sums_slider_draws_another_cost_and_number_of_sums():
+    control = widgets.sums_slider(get_task("CarCircle"), cost=60, known=1)
+    cost, known = control.kwargs_widgets
+
+    def rows():
+        return [label.get_text() for label in control.result.axes[0].get_yticklabels()]
+
+    assert rows() == ["steady: 60", "1 sum, least: 21.0", "1 sum, most: 157.7"]
+    known.value = 3
+    assert rows() == ["steady: 60", "3 sums, least: 58.1", "3 sums, most: 62.3"]
+    cost.value = 30
+    assert rows()[0] == "steady: 30" and (known.min, known.max) == (1, 3)
+    assert repr(control) == "(Run the notebook for sliders: unsafe steps and known sums.)"
+
+
+def test_the_price_slider_draws_another_price_under_the_same_limit():
+    control = widgets.price_slider(limit=1.0, start=0.2)
+    bound = control.result.axes[1].get_title()
+    assert control.result.axes[0].get_title() == "price 0.20" and bound.startswith("g(0.20) = ")
+    control.kwargs_widgets[0].value = 1.5
+    left, right = control.result.axes
+    assert left.get_title() == "price 1.50" and right.get_title().split(", ")[1] == bound.split(", ")[1]
+    assert repr(control) == "(Run the notebook for sliders: price.)"
+
+
+def test_moving_kappa_moves_the_expectile():
+    control = widgets.expectile_slider([0.1, 0.2, 0.3, 0.4], [0.0, 0.0, 0.0, 10.0], kappa=0.9)
+    (kappa,) = control.kwargs_widgets
+    assert control.result.axes[0].get_title() == "kappa = 0.9: V = 7.50"
+    kappa.value = 0.5
+    assert control.result.axes[0].get_title() == "kappa = 0.5: V = 2.50"

@@ -1,7 +1,7 @@
 """The bias of maxima over learned values, on a bandit and with small critics on a shipped dataset."""
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -11,8 +11,17 @@ from torch import Tensor
 
 from tutorial_lib.config import Config
 from tutorial_lib.data.dataset import Dataset, sample_batch
-from tutorial_lib.losses import expectile_loss, td_loss, td_target
-from tutorial_lib.networks import ActionDecoder, ActionEncoder, Critics, Value, latent_kl, vae_loss
+from tutorial_lib.losses import awr_weight, expectile_loss, policy_loss, td_loss, td_target
+from tutorial_lib.networks import (
+    ActionDecoder,
+    ActionEncoder,
+    Critics,
+    Policy,
+    Value,
+    gaussian_log_prob,
+    latent_kl,
+    vae_loss,
+)
 from tutorial_lib.tasks import Task, make_env
 
 
@@ -61,6 +70,13 @@ class Critic:
     def v(self, observations: Tensor) -> Tensor:
         """V(s), (B,), for observations (B, obs)."""
         return self.value(self.observed(observations))
+
+    @torch.no_grad()
+    def awr_weights(self, dataset: Dataset, alpha: float) -> Tensor:
+        """The weights min(exp(alpha (Q - V)), 100) of eq. 8 of all recorded steps, (n,)."""
+        data = dataset.tensors()
+        parts = zip(data.observations.split(8192), data.actions.split(8192), strict=True)
+        return torch.cat([awr_weight(self.target_q(s, a) - self.v(s), alpha) for s, a in parts])
 
     def observed(self, observations: Tensor) -> Tensor:
         """The standardised observations, in the same shape."""
@@ -118,28 +134,69 @@ def train_critic(
     return Course(at, q, critic)
 
 
-def play_greedy(
-    critic: Critic, task: Task, gamma: float = 0.99, seed: int = 0, points: int = 21
-) -> tuple[float | None, float]:
-    """Play one episode with the action of highest Q among a grid of `points` values per component in [-1, 1].
+Act = Callable[[Tensor], Tensor]
+"""A way to act: it returns an action (act,) for an observation (obs,)."""
 
-    Returns the highest Q at the first step, and the discounted sum of the rewards of the episode.
+
+def greedy(q: Callable[[Tensor, Tensor], Tensor], act_dim: int, points: int = 21) -> Act:
+    """Returns the way to act that takes the action of highest Q among a grid of all actions.
+
+    The grid has `points` values per component in [-1, 1]. `q` returns Q (n,) for observations (n, obs) and
+    actions (n, act).
     """
-    line = torch.linspace(-1, 1, points)
-    grid = torch.cartesian_prod(*[line] * task.act_dim)
-    env = make_env(task)
-    observation, _ = env.reset(seed=seed)
-    claim, earned = None, 0.0
-    for t in range(task.horizon):
-        with torch.no_grad():
-            q = critic.q(torch.tensor(observation).expand(len(grid), -1), grid)
-        claim = q.max().item() if claim is None else claim
-        observation, reward, terminated, *_ = env.step(grid[q.argmax()].numpy())
-        earned += gamma**t * reward
-        if terminated:
-            break
+    grid = torch.cartesian_prod(*[torch.linspace(-1, 1, points)] * act_dim)
+    return lambda observation: grid[q(observation.expand(len(grid), -1), grid).argmax()]
+
+
+def fit_policy(
+    dataset: Dataset, weights: Tensor, updates: int = 1000, seed: int = 0, learning_rate: float = 1e-3
+) -> Act:
+    """Returns a way to act that is fitted to the recorded actions by weighted maximum likelihood.
+
+    `weights` are (n,), one per recorded step: those of eq. 8, or ones for plain imitation. The policy is a
+    Gaussian, and the way to act is its mean. Batches have 256 steps.
+    """
+    data, generator = dataset.tensors(), torch.Generator().manual_seed(seed)
+    mean, std = data.observations.mean(0), data.observations.std(0) + 1e-3
+    sizes = data.observations.shape[1], data.actions.shape[1]
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        policy = Policy(*sizes, Config(hidden_width=64))
+    optimiser = torch.optim.Adam(policy.parameters(), learning_rate)
+    for _ in range(updates):
+        rows = torch.randint(len(weights), (256,), generator=generator)
+        log_prob = gaussian_log_prob(data.actions[rows], *policy((data.observations[rows] - mean) / std))
+        optimiser.zero_grad()
+        policy_loss(weights[rows], log_prob).backward()
+        optimiser.step()
+    return lambda observation: policy(((observation - mean) / std)[None])[0][0]
+
+
+@torch.no_grad()
+def promised_and_earned(
+    q: Callable[[Tensor, Tensor], Tensor], act: Act, task: Task, seeds: Sequence[int], gamma: float = 0.99
+) -> tuple[float, float]:
+    """Plays one episode per seed, and returns what Q promised and what was earned, as means over them.
+
+    The promise is Q(s, a) at the first step, for the action that is taken there. What was earned is the
+    discounted sum of the rewards of the episode. `q` takes observations (1, obs) and actions (1, act).
+    """
+    env, found = make_env(task), []
+    for seed in seeds:
+        observation, _ = env.reset(seed=seed)
+        promised = earned = 0.0
+        for t in range(task.horizon):
+            now = torch.as_tensor(observation)
+            action = act(now)
+            promised = q(now[None], action[None]).item() if t == 0 else promised
+            observation, reward, terminated, *_ = env.step(action.numpy())
+            earned += gamma**t * reward
+            if terminated:
+                break
+        found.append((promised, earned))
     env.close()
-    return claim, earned
+    promise, worth = np.mean(found, axis=0)
+    return float(promise), float(worth)
 
 
 def latent_divergences(

@@ -1,12 +1,14 @@
 """Sliders for the notebooks, and a function that prints paragraphs of the library's code.
 
 The callback of a control is a plain function that returns a figure. So it can be called and tested without a
-widget. Where no kernel runs (on GitHub and on the site), a static figure after the control is drawn by the
-same function.
+widget. Where no kernel runs, the site and the slides show pictures that the same function drew before. GitHub
+shows the text of a control.
 """
 
 import inspect
+import os
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import ipywidgets
@@ -18,6 +20,7 @@ from tutorial_lib.agents import Agent
 from tutorial_lib.costs.conditioning import ConditioningConfig
 from tutorial_lib.costs.reconstruction import CostReconstruction
 from tutorial_lib.course import figures, laps
+from tutorial_lib.course.pictures import store_pictures
 from tutorial_lib.data.dataset import Dataset
 from tutorial_lib.playing import rollout
 from tutorial_lib.style import Picture
@@ -29,11 +32,15 @@ SLIDER = {"continuous_update": False, "style": {"description_width": "initial"}}
 class Controls(ipywidgets.interactive):
     """`ipywidgets.interactive` that displays the figure which its callback returns.
 
-    Its text, which is shown where no kernel runs, names the sliders.
+    Its text, which is shown where no kernel runs, names the sliders. If the environment variable
+    C2IQL_PICTURES names a folder, the pictures of the control are written to the next of its folders
+    0, 1, ... for the site and the slides.
     """
 
     def __init__(self, callback: Callable[..., Figure], **sliders: ipywidgets.Widget) -> None:
         super().__init__(callback, {"auto_display": True}, **sliders)
+        if folder := os.environ.get("C2IQL_PICTURES"):
+            store_pictures(callback, sliders, Path(folder, str(len(list(Path(folder).glob("*"))))))
 
     def __repr__(self) -> str:
         names = " and ".join(widget.description for widget in self.kwargs_widgets)
@@ -147,11 +154,11 @@ def checkpoint_slider(checkpoints: int = 20, episodes: int = 5) -> Controls:
     return Controls(figures.lucky_checkpoints, checkpoints=counts, episodes=played)
 
 
-def expectile_slider(values: ArrayLike, kappa: float = 0.7) -> Controls:
-    """`figures.expectile_of` for values (n,), with a slider for kappa."""
+def expectile_slider(actions: ArrayLike, q: ArrayLike, kappa: float = 0.7) -> Controls:
+    """`figures.expectile_of` for actions (n,) of one state and their Q (n,), with a slider for kappa."""
     options = [0.1, 0.3, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.97, 0.99, 0.999]
     kappas = ipywidgets.SelectionSlider(options=options, value=kappa, description="kappa", **SLIDER)
-    return Controls(lambda kappa: figures.expectile_of(values, kappa), kappa=kappas)
+    return Controls(lambda kappa: figures.expectile_of(actions, q, kappa), kappa=kappas)
 
 
 def print_lines(function: Callable[..., Any], first: int, last: int | None = None) -> None:
@@ -165,17 +172,6 @@ def print_lines(function: Callable[..., Any], first: int, last: int | None = Non
             print(inspect.cleandoc("\n" + paragraph), end="\n\n")
             return
     raise ValueError(f"no paragraph of {function.__qualname__} starts with '# {words}'")
-
-
-def price(limit: float, price: float) -> Picture:
-    """Draws a price of cost on the tabular shortcut: the slope that it means, and its bound g(price)."""
-    return figures.price_of_limit(limit, price)
-
-
-def price_slider(limit: float = 1.0, start: float = 0.2) -> Controls:
-    """`price` with a slider for the price of a unit of discounted cost. The limit stays as it is."""
-    prices = ipywidgets.FloatSlider(start, min=0, max=2, step=0.05, description="price", **SLIDER)
-    return Controls(lambda price: figures.price_of_limit(limit, price), price=prices)
 
 
 def sums_slider(task: Task, cost: float = 60, known: int = 1) -> Controls:
@@ -192,3 +188,29 @@ def sums_slider(task: Task, cost: float = 60, known: int = 1) -> Controls:
         cost=costs,
         known=counts,
     )
+
+
+def price(limit: float, price: float) -> Picture:
+    """Draws a price of cost on the tabular shortcut: the slope that it means, and its bound g(price)."""
+    return figures.price_of_limit(limit, price)
+
+
+def price_slider(limit: float = 1.0, start: float = 0.2) -> Controls:
+    """`price` with a slider for the price of a unit of discounted cost. The limit stays as it is."""
+    prices = ipywidgets.FloatSlider(start, min=0, max=2, step=0.05, description="price", **SLIDER)
+    return Controls(lambda price: figures.price_of_limit(limit, price), price=prices)
+
+
+def charge(limit: float, price: float) -> Figure:
+    """Draws the priced Q of the state of `penalise` under a limit, and the implicit policy for kappa 0.9.
+
+    The price is in reward per unsafe step beyond the limit.
+    """
+    return figures.penalised_state(*SEVEN_ACTIONS, limit, kappa=0.9, price=price)
+
+
+def charge_sliders(limit: int = 20, price: float = 2.0) -> Controls:
+    """`charge` with a slider for the limit and one for the price."""
+    limits = ipywidgets.IntSlider(limit, 0, 60, 2, description="limit", **SLIDER)
+    prices = ipywidgets.FloatSlider(price, min=0.0, max=5.0, step=0.25, description="price", **SLIDER)
+    return Controls(charge, limit=limits, price=prices)

@@ -5,7 +5,8 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from tutorial_lib.course.checks.checker import try_answer
+from tutorial_lib.course.checks.checker import text, try_answer
+from tutorial_lib.course.tabular import expectile, expectile_weight, implicit_policy
 
 
 class _Slope:
@@ -69,3 +70,81 @@ def check_batched_loss(answer: Callable) -> None:
     ]
     tensors = [(tuple(torch.tensor(np.array(part)) for part in x), *rest) for x, *rest in cases]
     try_answer(answer, tensors)
+
+
+def check_priced_q(answer: Callable) -> None:
+    """Checks an exercise of notebook 8.
+
+    `answer(q_reward, q_cost, v_cost, limit, price)` returns the priced values, (S, A). Q_r and Q_c are
+    (S, A), and V_c is (S,).
+    """
+    q_r, q_c = np.array([[5.0, -5.0, -9.0]]), np.array([[10.0, 40.0, 90.0]])
+    rng = np.random.default_rng(0)
+    rewards, costs, state = 10 * rng.normal(size=(4, 3)), 60 * rng.random((4, 3)), 60 * rng.random(4)
+    excess = [[max(0.0, x - 30) - max(0.0, v - 30) for x in row] for row, v in zip(costs, state, strict=True)]
+    cases = [
+        ((q_r, q_c, np.array([20.0]), 100.0, 2.0), q_r, "all costs keep the limit: nothing is paid"),
+        (
+            (q_r, q_c, np.array([20.0]), 30.0, 2.0),
+            np.array([[5.0, -25.0, -129.0]]),
+            "an action pays for its cost beyond the limit: 2 (40 - 30) and 2 (90 - 30), and it keeps its Q_r",
+        ),
+        (
+            (q_r, q_c, np.array([50.0]), 30.0, 2.0),
+            np.array([[45.0, 15.0, -89.0]]),
+            "what the state pays in any case, 2 (50 - 30), is given back to each of its actions",
+        ),
+        ((q_r, q_c, np.array([50.0]), np.inf, 2.0), q_r, "under an infinite limit nothing is paid"),
+        (
+            (rewards, costs, state, 30.0, 0.5),
+            rewards - 0.5 * np.array(excess),
+            "V_c is (S,): v_cost[:, None] stands beside each of the actions of its own state",
+        ),
+    ]
+    try_answer(answer, cases)
+
+
+def check_sign_trap(q_reward, q_cost, limit) -> None:
+    """Checks an exercise of notebook 8: a state in which the zero of eq. 11 prefers an unsafe action.
+
+    The unsafe action must earn less than a safe one. Q_r and Q_c (A,) belong to the same actions.
+    """
+    mistake = _sign_trap_mistake(q_reward, q_cost, limit)
+    if mistake:
+        print(f"NOT YET  {mistake}")
+        return
+    q_r, q_c = np.asarray(q_reward, float), np.asarray(q_cost, float)
+    even = np.full((1, len(q_r)), 1 / len(q_r))
+    penalised = np.where(q_c <= float(limit), q_r, 0.0)[None]
+    value = expectile(even, penalised, 0.9)
+    policy = implicit_policy(even, penalised, value, lambda u: expectile_weight(u, 0.9))[0]
+    print(f"OK  eq. 11 prefers an unsafe action: Q_(r|c) = {text(penalised[0])}")
+    print(f"    cost with mu even: {text(q_c.mean())}; cost of pi_imp with kappa 0.9: {text(policy @ q_c)}")
+
+
+def _sign_trap_mistake(q_reward, q_cost, limit) -> str:
+    """Returns what keeps an answer of `check_sign_trap` from being a trap, or an empty text."""
+    if any(part is ... for part in (q_reward, q_cost, limit)):
+        return "write numbers in place of the `...`"
+    try:
+        q_r, q_c, limit = np.asarray(q_reward, float), np.asarray(q_cost, float), float(limit)
+    except (TypeError, ValueError):
+        return "q_reward and q_cost are lists of numbers, and limit is a number"
+    if q_r.ndim != 1 or q_r.shape != q_c.shape or len(q_r) < 2:
+        return f"Q_r and Q_c need a number per action, for two actions or more: {q_r.shape}, {q_c.shape}"
+    if not np.isfinite([*q_r, *q_c]).all() or (q_c < 0).any():
+        return "all Q must be finite, and a cost is not negative"
+    safe = q_c <= limit
+    if safe.all():
+        return "all actions are safe, so nothing is penalised: one must cost more than the limit"
+    if not safe.any():
+        return "no action is safe, so all are worth 0 and pi_imp is mu: that is another trap. Keep one safe"
+    if q_r[~safe].max() >= q_r[safe].max():
+        return (
+            "an unsafe action earns most even without a penalty: the best safe one must have the higher Q_r"
+        )
+    if q_r[safe].max() > 0:
+        return "the best safe action has Q_r > 0 and zero is below it: a punishment. When is zero a reward?"
+    if q_r[safe].max() == 0:
+        return "the best safe action has Q_r = 0, a draw with the unsafe one: which sign of Q_r breaks it?"
+    return ""

@@ -1,13 +1,24 @@
-"""The figures of notebook 3: the bias of a maximum, expectiles, and implicit policies."""
+"""The figures of notebooks 3 and 4: the bias of a maximum, expectiles, and implicit policies."""
 
 import numpy as np
 from matplotlib import ticker
 
 from tutorial_lib.course.maximisation_bias import bandit_logs, bandit_value
 from tutorial_lib.course.tabular import expectile
-from tutorial_lib.style import COST, DASHED, LIMIT, NEUTRAL, REWARD, legend_below, one_figure, subplots
+from tutorial_lib.style import (
+    COST,
+    DASHED,
+    LIMIT,
+    NEUTRAL,
+    REWARD,
+    described,
+    legend_below,
+    one_figure,
+    subplots,
+)
 
 STAR = {"marker": "*", "markersize": 20, "linestyle": "none", "color": COST, "markeredgecolor": LIMIT}
+THIN = DASHED | {"linewidth": 1.5}
 
 
 @one_figure
@@ -39,26 +50,61 @@ def two_maxima(seed: int = 0, arms: int = 20, degree: int = 2):
         title="no support: few actions were recorded", xlabel="action", ylim=(-1.5, 5.6), xlim=(-1.05, 1.05)
     )
     legend_below(figure, noise, support)
-    return figure
+    return described(
+        figure,
+        f"Left: {arms} noisy estimates of actions that are all worth 0; a star marks the largest. Right: "
+        "six parabolas are fitted to rewards that were recorded for a narrow range of actions; a star marks "
+        "the maximum of each. Most stars lie outside of this range, and some lie far beyond the cliff where "
+        "the true reward falls to -1.",
+    )
+
+
+@one_figure
+def promises_over_data(sizes, found: dict):
+    """Draws what actions promise and what they are worth, over the number of records, one panel per rule.
+
+    `found` is {title: (repeats, len(sizes), 2)}: promise and truth of each repetition. Lines are medians, and
+    the bands hold the middle half of the repetitions.
+    """
+    figure, axes = subplots(1, len(found), figsize=(12, 4.6), sharey=True, squeeze=False)
+    looks = ("promised", NEUTRAL, "o"), ("worth", REWARD, "s")
+    for ax, (title, values) in zip(axes[0], found.items(), strict=True):
+        for (label, colour, marker), series in zip(looks, np.moveaxis(values, 2, 0), strict=True):
+            low, middle, high = np.quantile(series, (0.25, 0.5, 0.75), axis=0)
+            ax.plot(sizes, middle, color=colour, marker=marker, markersize=9, label=label)
+            ax.fill_between(sizes, low, high, color=colour, alpha=0.2, linewidth=0)
+        ax.set(title=title, xscale="log", xlabel="recorded steps", xticks=sizes)
+        ax.xaxis.set_major_formatter("{x:g}")
+        ax.xaxis.set_minor_locator(ticker.NullLocator())
+    axes[0, 0].set_ylabel("reward of the chosen action")
+    legend_below(figure, axes[0, 0])
+    middles = {title: np.median(values, axis=0) for title, values in found.items()}
+    ends = "; ".join(
+        f"{title}: from {first[0]:.1f} promised and {first[1]:.1f} earned to {last[0]:.1f} and {last[1]:.1f}"
+        for title, (first, *_, last) in middles.items()
+    )
+    return described(figure, f"Promise and truth from {sizes[0]} to {sizes[-1]} recorded steps. {ends}.")
 
 
 @one_figure
 def courses(panels: dict):
     """Draws the mean Q of recorded actions over the updates, on a log scale, with one panel per title.
 
-    `panels` is {title: ({label: maximisation_bias.Course}, achieved, ceiling)}. The curve with the label
-    "maximum" is orange. Dashed lines show the value that was achieved and the value that no policy can
-    exceed.
+    `panels` is {title: ({label: (updates, q)}, achieved, ceiling)}. The curve with the label "maximum" is
+    orange. Dashed lines show the largest value that was achieved and the value that no policy can exceed.
     """
-    figure, axes = subplots(1, len(panels), figsize=(12, 5.4), sharey=True, squeeze=False)
+    figure, axes = subplots(1, len(panels), figsize=(12, 5.4), sharex=True, sharey=True, squeeze=False)
     for ax, (title, (found, achieved, ceiling)) in zip(axes[0], panels.items(), strict=True):
-        blues = iter(np.linspace(0.55, 1, max(len(found) - 1, 1)))
-        for label, course in found.items():
-            look = {"color": COST} if label == "maximum" else {"color": REWARD, "alpha": next(blues)}
-            ax.plot(course.updates, course.q, label=label, **look)
+        blues = iter(np.linspace(1, 0.45, max(len(found) - 1, 1)))
+        widths = iter((2.5, 3.5, 4.5))
+        for label, (updates, q) in found.items():
+            if label == "maximum":
+                ax.plot(updates, q, label=label, color=COST, linestyle="--")
+            else:
+                ax.plot(updates, q, label=label, color=REWARD, alpha=next(blues), linewidth=next(widths))
         labels = ((achieved, "achieved", "top", -4), (ceiling, "ceiling", "bottom", 4))
         for level, words, va, offset in labels:
-            ax.axhline(level, **DASHED | {"linewidth": 1.5})
+            ax.axhline(level, **THIN)
             place = {"xy": (0.01, level), "xycoords": ("axes fraction", "data"), "xytext": (0, offset)}
             ax.annotate(words, va=va, textcoords="offset points", fontsize=13, **place)
         ax.set(title=title, xlabel="updates", yscale="log")
@@ -66,80 +112,126 @@ def courses(panels: dict):
         ax.yaxis.set_major_locator(ticker.LogLocator(subs=(1, 3)))
         ax.yaxis.set_major_formatter("{x:g}")
         ax.yaxis.set_minor_locator(ticker.NullLocator())
-    axes[0, 0].set_ylabel("mean Q of recorded actions")
+    axes[0, 0].set_ylabel("mean Q of recorded actions\n(discounted reward)")
     legend_below(figure, *axes[0])
-    return figure
+    last = "; ".join(
+        f"{title}: " + ", ".join(f"{label} {q[-1]:.0f}" for label, (_, q) in found.items())
+        + f", achieved {achieved:.0f}, ceiling {ceiling:.0f}"
+        for title, (found, achieved, ceiling) in panels.items()
+    )  # fmt: skip
+    return described(figure, f"Mean Q of recorded actions over the updates of training. At the end, {last}.")
 
 
 @one_figure
-def expectile_of(values, kappa: float):
-    """Draws a distribution of Q (n,) with its kappa-expectile, and the expectile for every kappa.
+def promises_kept(found: dict):
+    """Draws what a robot's critic promised and what the robot earned, on a log scale, a pair of bars per row.
 
-    The left panel also names the weight of the values on each side of the expectile.
+    `found` is {words: (promised, earned)}, in discounted reward. A bar of less than 1 has the length 1.
     """
-    values = np.asarray(values, float)[None]
-    mu = np.full(values.shape, 1 / values.size)
-    level = expectile(mu, values, kappa)[0]
-    figure, (left, right) = subplots(1, 2, figsize=(12, 4.6))
-    worse, better = values[values < level], values[values >= level]
-    left.hist(
-        [worse, better],
-        bins=np.histogram_bin_edges(values, 40),
-        stacked=True,
-        color=[NEUTRAL, REWARD],
-        label=[f"worse: weight {1 - kappa:.3g}", f"better: weight {kappa:.3g}"],
-    )
-    left.axvline(level, color=LIMIT, label="expectile")
-    left.axvline(values.mean(), **DASHED | {"linewidth": 1.5}, label="mean")
-    left.axvline(values.max(), color=COST, linewidth=1.5, label="best recorded")
-    left.set(title=f"kappa = {kappa:g}: V = {level:.1f}", xlabel="Q of recorded actions", yticks=[])
+    figure, ax = subplots(figsize=(11, 1.3 + 0.95 * len(found)))
+    rows = np.arange(len(found))[::-1]
+    for column, (label, colour) in enumerate((("promised", NEUTRAL), ("earned", REWARD))):
+        values = np.array([pair[column] for pair in found.values()])
+        places = rows + 0.2 - 0.4 * column
+        ax.barh(places, np.maximum(values, 1), 0.38, color=colour, label=label)
+        for place, value in zip(places, values, strict=True):
+            ax.text(1.08 * max(value, 1), place, f"{value:.0f}", va="center")
+    ax.set(xscale="log", xlabel="discounted reward of an episode", yticks=rows, xlim=(1, None))
+    ax.set_yticklabels(found)
+    ax.xaxis.set_major_formatter("{x:g}")
+    ax.margins(x=0.12)
+    legend_below(figure, ax)
+    shown = "; ".join(f"{words}: {p:.0f} promised, {e:.0f} earned" for words, (p, e) in found.items())
+    return described(figure, f"What critics promised at the start, and what the robots earned. {shown}.")
 
+
+@one_figure
+def expectile_of(actions, q, kappa: float):
+    """Draws the recorded actions (n,) of one state with their Q (n,), and the kappa-expectile V of this Q.
+
+    The left panel names the weight of the actions on each side of V. The right panel draws V for every kappa.
+    """
+    actions, values = np.asarray(actions, float), np.asarray(q, float)[None]
+    mu = np.full(values.shape, 1 / values.size)
+    level, mean, best = expectile(mu, values, kappa)[0], values.mean(), values.max()
+    figure, (left, right) = subplots(1, 2, figsize=(12, 4.8), sharey=True, width_ratios=(3, 2))
+    better = values[0] >= level
+    sides = ((~better, "v", NEUTRAL, "worse", 1 - kappa), (better, "^", REWARD, "better", kappa))
+    for side, marker, colour, words, weight in sides:
+        label = f"{words} than V: weight {weight:.3g}"
+        left.plot(actions[side], values[0, side], marker, color=colour, markersize=8, alpha=0.7, label=label)
     grid = np.linspace(0.01, 0.999, 100)
-    curve = [expectile(mu, values, k)[0] for k in grid]
-    right.plot(grid, curve, color=LIMIT)
+    right.plot(grid, [expectile(mu, values, k)[0] for k in grid], color=LIMIT)
     right.plot(kappa, level, "o", color=REWARD, markersize=12)
-    right.axhline(values.max(), color=COST, linewidth=1.5)
-    right.axhline(values.mean(), **DASHED | {"linewidth": 1.5})
-    right.set(title="V over kappa", xlabel="kappa")
+    for ax in (left, right):
+        ax.axhline(level, color=LIMIT, label="V, the expectile")
+        ax.axhline(mean, **THIN, label="mean")
+        ax.axhline(best, color=COST, linewidth=1.5, label="best recorded")
+    left.set(title=f"kappa = {kappa:g}: V = {level:.2f}", xlabel="recorded action", ylabel="Q of one state")
+    right.set(title="V for every kappa", xlabel="kappa")
     legend_below(figure, left)
-    return figure
+    return described(
+        figure,
+        f"Left: {values.size} recorded actions of one state and their Q. The mean is {mean:.2f}, the best "
+        f"is {best:.2f}, and the expectile for kappa {kappa:g} is {level:.2f}. Right: the expectile rises "
+        "with kappa from the worst to the best recorded Q and never passes it.",
+    )
 
 
 @one_figure
 def implicit_policies(actions, mu, q, found: dict):
-    """Draws implicit policies over one continuous action, with Q and V above and the policies below.
+    """Draws implicit policies over one continuous action, and their ratio to the recorded policy over Q - V.
 
-    `found` is {name: (V, policy)}. The arrays actions, mu, q and each policy are (n,). The two panels of a
-    column share the action axis.
+    `found` is {name: (V, policy)}. The arrays actions, mu, q and each policy are (n,). Each name has a
+    column. Above are the densities, scaled to a largest value of 1, and below is pi_imp / mu on a log axis.
     """
-    figure, axes = subplots(2, len(found), figsize=(12, 6), sharex=True, sharey="row", squeeze=False)
+    figure, axes = subplots(2, len(found), figsize=(12, 7), sharex="row", sharey="row", squeeze=False)
+    lowest = 0.0
     for (above, below), (name, (v, policy)) in zip(axes.T, found.items(), strict=True):
-        above.plot(actions, q, color=LIMIT, label="Q")
-        above.axhline(v, color=REWARD, linestyle="--", label="V")
-        below.fill_between(
-            actions, mu / mu.max(), color=NEUTRAL, alpha=0.4, linewidth=0, label="recorded policy"
-        )
-        below.plot(actions, policy / policy.max(), color=REWARD, label="implicit policy")
-        above.set(title=name)
-        below.set(xlabel="action", yticks=[])
-    axes[1, 0].set_ylabel("scaled to 1")
+        grey = {"color": NEUTRAL, "alpha": 0.4, "linewidth": 0}
+        above.fill_between(actions, mu / mu.max(), **grey, label="recorded policy")
+        above.plot(actions, policy / policy.max(), color=REWARD, label="implicit policy")
+        above.set(title=name, xlabel="action")
+        u, ratio = np.asarray(q) - v, np.asarray(policy) / mu
+        lowest = min(lowest, u.min())
+        order = u.argsort()
+        below.plot(u[order], ratio[order], color=REWARD)
+        below.axvline(0, color=LIMIT, linestyle="--", linewidth=1.5, label="V")
+        below.axhline(1, color=NEUTRAL, linewidth=1.5)
+        below.set(xlabel="u = Q - V", yscale="log", ylim=(0.03, 30))
+        below.yaxis.set_major_formatter("{x:g}")
+    axes[0, 0].set(ylabel="density,\nscaled to 1")
+    axes[1, 0].set(ylabel="weight: implicit /\nrecorded policy")
     legend_below(figure, *axes[:, 0])
-    return figure
+    return described(
+        figure,
+        f"Implicit policies of {', '.join(found)}. Above: the recorded policy and each implicit policy over "
+        "the action. Below: the ratio of both over Q - V, on a logarithmic scale.",
+    )
 
 
 @one_figure
-def towards_the_maximum(kappas, values, levels: dict):
-    """Draws V of the start state, (k,), over 1 - kappa, as kappa approaches 1.
+def hidden_policies(kappas, rewards, costs, levels: dict, limit: float):
+    """Draws V_r at the start, (k,), and the cost of its implicit policy, (k,), over 1 - kappa.
 
-    `levels` maps a name to a value, and a dashed line shows each value.
+    `levels` maps a name to a value of V_r, and a dashed line shows each. `limit` is a limit on the cost.
     """
-    figure, ax = subplots(figsize=(11, 4.6))
-    ax.plot(1 - np.asarray(kappas), values, "o-", color=REWARD, label="V of IQL")
-    for level, (words, colour) in zip(
-        levels.values(), zip(levels, (NEUTRAL, LIMIT, COST), strict=False), strict=True
-    ):
-        ax.axhline(level, color=colour, linestyle="--", linewidth=2, label=words)
-    ax.set(xscale="log", xlabel="1 - kappa", ylabel="V at the start")
-    ax.invert_xaxis()
-    legend_below(figure, ax)
-    return figure
+    figure, (left, right) = subplots(1, 2, figsize=(12, 5), sharex=True)
+    x = 1 - np.asarray(kappas)
+    left.plot(x, rewards, "o-", color=REWARD, label="V_r of IQL")
+    for (words, level), colour in zip(levels.items(), (NEUTRAL, LIMIT, COST), strict=True):
+        left.axhline(level, color=colour, linestyle=":", linewidth=2.5, label=words)
+    right.plot(x, costs, "s-", color=COST, label="cost of its hidden policy")
+    right.axhline(limit, **DASHED, label=f"limit {limit:g}")
+    left.set(xscale="log", xlabel="1 - kappa", ylabel="V_r at the start\n(discounted reward)")
+    right.set(xlabel="1 - kappa", ylabel="V_c at the start\n(discounted cost)", ylim=(0, None))
+    left.invert_xaxis()
+    left.xaxis.set_major_formatter("{x:g}")
+    legend_below(figure, left, right)
+    named = ", ".join(f"{words} {level:.2f}" for words, level in levels.items())
+    return described(
+        figure,
+        f"Left: V_r at the start rises from {rewards[0]:.2f} to {rewards[-1]:.2f} as kappa grows from "
+        f"{kappas[0]:g} to {kappas[-1]:g}. Levels: {named}. Right: the discounted cost of the policy behind "
+        f"this V_r goes from {costs[0]:.2f} to {costs[-1]:.2f}; the limit is {limit:g}.",
+    )

@@ -1,9 +1,21 @@
 """The figures of penalties and implicit policies: critics outside the data, and the effect of a limit."""
 
+import functools
+
 import numpy as np
 
 from tutorial_lib.course import tabular
-from tutorial_lib.style import COST, DASHED, LIMIT, NEUTRAL, REWARD, legend_below, one_figure, subplots
+from tutorial_lib.style import (
+    COST,
+    DASHED,
+    LIMIT,
+    NEUTRAL,
+    REWARD,
+    described,
+    legend_below,
+    one_figure,
+    subplots,
+)
 
 
 @one_figure
@@ -23,12 +35,17 @@ def outside_data(grid, estimates, truth, recorded, limit: float):
         left.plot(grid, line, color=COST, alpha=0.45, linewidth=1.2, label="" if row else "a critic")
     left.plot(grid, truth, color=LIMIT, label="truth")
     left.axhline(limit, **DASHED, label="limit")
-    left.set(title="expected cost", ylim=(0, 1.1 * truth.max()))
-    right.plot(grid, (estimates <= limit).mean(0), color=COST)
-    right.plot(grid, truth <= limit, color=LIMIT)
-    right.set(title="called safe: share of critics, and truth", ylim=(-0.03, 1.05))
+    left.set(title="expected cost", ylabel="unsafe steps", ylim=(0, 1.1 * truth.max()))
+    right.plot(grid, (estimates <= limit).mean(0), color=COST, linewidth=7, alpha=0.6)
+    right.plot(grid, truth <= limit, color=LIMIT, linewidth=2)
+    right.set(title="called safe", ylabel="share of critics; truth", ylim=(-0.03, 1.05))
     legend_below(figure, left)
-    return figure
+    return described(
+        figure,
+        "Left: the expected cost of an action, as predicted by twenty critics and in truth. The lines agree "
+        "where actions were recorded. On the right the truth jumps over the limit and most critics do not. "
+        "Right: the share of critics that call an action safe.",
+    )
 
 
 @one_figure
@@ -45,9 +62,14 @@ def ood_detector(divergences: dict):
         ax.hist(recorded, bins, color=REWARD, alpha=0.55, label="recorded actions")
         ax.hist(random, bins, color=COST, alpha=0.55, label="random actions")
         ax.axvline(np.quantile(both, 0.75), **DASHED, label="upper quarter: 'outside'")
-        ax.set(xscale="log", title=name, xlabel="KL divergence of the latent", yticks=[])
+        ax.set(xscale="log", title=name, xlabel="KL divergence of the code")
+    axes[0, 0].set_ylabel("number of actions")
     legend_below(figure, axes[0, 0])
-    return figure
+    return described(
+        figure,
+        "Histograms of the KL divergence for recorded and for random actions, which overlap. A dashed line "
+        f"marks the upper quarter of all. Panels: {', '.join(divergences)}.",
+    )
 
 
 @one_figure
@@ -64,7 +86,9 @@ def against_truth(truth, values: dict):
     ax.set(xlabel="$V_c$ of $\\pi_{imp}$, by a linear solve", ylabel="by the formula")
     ax.set(xlim=(0, end), ylim=(0, None))
     legend_below(figure, ax)
-    return figure
+    return described(
+        figure, f"Values by formulas over their true values, with the diagonal. Shown: {', '.join(values)}."
+    )
 
 
 @one_figure
@@ -78,43 +102,70 @@ def values_by_state(values: dict):
     ax.set(xlabel="state", ylabel="$V_c$", xticks=range(len(row)))
     ax.set_ylim(0, 1.12 * max(np.max(row) for row in values.values()))
     legend_below(figure, ax)
-    return figure
+    return described(figure, f"One value for each state. Shown: {', '.join(values)}.")
 
 
 @one_figure
-def cost_of_limits(limits, costs: dict):
-    """Draws the costs of implicit policies, {label: (n,)}, that were trained for each of `limits` (n,).
+def flips(histories: dict, limit: float):
+    """Draws the Q_c of one action over the iterations of CIQL, with one panel per title.
+
+    `histories` maps a title to the values (n,). The marks are orange where the action is unsafe.
+    """
+    figure, axes = subplots(1, len(histories), figsize=(12, 4.2), sharey=True, squeeze=False)
+    for ax, (title, row) in zip(axes[0], histories.items(), strict=True):
+        steps, row = np.arange(len(row)), np.asarray(row)
+        ax.plot(steps, row, color=NEUTRAL, linewidth=1)
+        for unsafe, colour, label in ((False, REWARD, "called safe"), (True, COST, "called unsafe")):
+            here = (row > limit) == unsafe
+            ax.plot(steps[here], row[here], "o", color=colour, markersize=5, label=label)
+        ax.axhline(limit, **DASHED, label=r"limit $\tilde L$")
+        ax.set(title=title, xlabel="iteration")
+    axes[0, 0].set_ylabel("$Q_c$ of the risky action")
+    legend_below(figure, axes[0, 0])
+    return described(
+        figure,
+        "Q_c of the risky action over the iterations. It crosses the dashed limit again and again, and "
+        f"changes from safe to unsafe each time. Panels: {', '.join(histories)}.",
+    )
+
+
+@one_figure
+def cost_of_limits(limits, costs: dict, ylabel: str = "cost of the implicit policy"):
+    """Draws the costs of policies, {label: (n,)}, that were trained for each of `limits` (n,).
 
     A NaN means that the iteration did not settle, and the line has a gap there. A policy below the dashed
-    line keeps its limit.
+    line keeps its limit. The marks become smaller from line to line, so that equal lines can be seen.
     """
     figure, ax = subplots(figsize=(11, 4.8))
     ax.plot([0, limits[-1]], [0, limits[-1]], **DASHED, label="cost = limit")
-    for (label, row), colour, marker in zip(costs.items(), (REWARD, NEUTRAL, COST), "os^", strict=False):
-        ax.plot(limits, row, marker + "-", color=colour, markersize=7, linewidth=1.5, label=label)
-    ax.set(xlabel=r"limit $\tilde L$", ylabel="cost of the implicit policy")
+    looks = ((REWARD, "o", 11), (NEUTRAL, "s", 7), (COST, "^", 4))
+    for (label, row), (colour, marker, size) in zip(costs.items(), looks, strict=False):
+        ax.plot(limits, row, marker + "-", color=colour, markersize=size, linewidth=1.5, label=label)
+    ax.set(xlabel=r"limit $\tilde L$ (discounted)", ylabel=ylabel)
     ax.set_xlim(0, 1.02 * limits[-1])
     ax.set_ylim(0, 1.1 * max(np.nanmax(row) for row in costs.values()))
     legend_below(figure, ax)
-    return figure
+    return described(
+        figure, f"The {ylabel} over the limit, with the line where both are equal: {'; '.join(costs)}."
+    )
 
 
 @one_figure
-def penalised_state(q_reward, q_cost, behaviour, limit: float, kappa: float):
+def penalised_state(q_reward, q_cost, behaviour, limit: float, kappa: float, price: float | None = None):
     """Draws eqs. 11 to 17 in one state with A actions: the penalty, V_r and the implicit policy.
 
-    The arrays q_reward, q_cost and behaviour are (A,). The function raises ValueError unless kappa lies
-    within (0, 1).
+    The arrays q_reward, q_cost and behaviour are (A,). With a `price`, an unsafe action is worth its Q_r
+    minus the price of its cost beyond the limit, and not zero. Raises ValueError unless kappa is in (0, 1).
     """
     if not 0 < kappa < 1:
         raise ValueError(f"kappa must lie in (0, 1), not {kappa}")
     q_reward, q_cost, behaviour = (np.asarray(x, float) for x in (q_reward, q_cost, behaviour))
     unsafe = q_cost > limit
-    q = np.where(unsafe, 0.0, q_reward)
+    priced = q_reward - (price or 0.0) * (q_cost - limit)
+    q = np.where(unsafe, 0.0 if price is None else priced, q_reward)
     v = tabular.expectile(behaviour[None], q[None], kappa)
-    policy = tabular.implicit_policy(
-        behaviour[None], q[None], v, lambda u: tabular.expectile_weight(u, kappa)
-    )[0]
+    weight = functools.partial(tabular.expectile_weight, kappa=kappa)
+    policy = tabular.implicit_policy(behaviour[None], q[None], v, weight)[0]
     actions = np.arange(len(q))
     colours = np.where(unsafe, COST, REWARD)
     figure, axes = subplots(1, 3, figsize=(12, 4.4))
@@ -132,6 +183,11 @@ def penalised_state(q_reward, q_cost, behaviour, limit: float, kappa: float):
     axes[1].bar([0], [0], color=REWARD, label="safe")
     axes[1].bar([0], [0], color=COST, label="unsafe")
     for ax in axes:
-        ax.set(xticks=actions, xticklabels=[chr(ord("a") + i) for i in actions])
+        ax.set(xlabel="action", xticks=actions, xticklabels=[chr(ord("a") + i) for i in actions])
     legend_below(figure, *axes)
-    return figure
+    return described(
+        figure,
+        f"One state with {len(q)} actions under the limit {limit:g}. Left: their costs. Middle: what each is "
+        f"worth after the penalty, and V_r = {v[0]:.1f}. Right: the behaviour and the implicit policy, which "
+        f"costs {policy @ q_cost:.1f}.",
+    )

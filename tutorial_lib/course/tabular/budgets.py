@@ -28,6 +28,27 @@ def rate_policy(cmdp: CMDP, limit: float, horizon: int) -> np.ndarray:
     return solve(cmdp, limit / horizon / (1 - cmdp.gamma)).policy
 
 
+def plan_budget(cmdp: CMDP, horizon: int, budget: int, price: float) -> tuple[np.ndarray, np.ndarray]:
+    """The best values and actions of an agent that sees its state, what is left of a budget, and the step.
+
+    The three together are the state of an MDP: a cost c leaves max(b - c, 0) of the budget b, and the step
+    rises by one. A cost beyond the budget is paid for with `price` (in reward) per unit. Sums are
+    undiscounted (eq. 1), and costs are whole numbers. The values, (T+1, budget+1, S), are the largest
+    expected sums of rewards minus payments from step t on, with b left. The actions are (T, budget+1, S) int.
+    Raises ValueError for costs that are negative or not whole.
+    """
+    if (cmdp.costs < 0).any() or (cmdp.costs % 1).any():
+        raise ValueError("a budget is counted in whole costs: they must be 0, 1, 2, ...")
+    left = np.arange(budget + 1)[:, None, None] - cmdp.costs.astype(int)  # (budget+1, S, A)
+    at_once = cmdp.rewards - price * (-left).clip(min=0)
+    values = np.zeros((horizon + 1, budget + 1, len(cmdp.initial)))
+    actions = np.zeros((horizon, budget + 1, len(cmdp.initial)), int)
+    for t in reversed(range(horizon)):
+        q = at_once + (cmdp.transitions * values[t + 1, left.clip(min=0)]).sum(-1)
+        values[t], actions[t] = q.max(-1), q.argmax(-1)
+    return values, actions
+
+
 class Spending(NamedTuple):
     """The expected return of a policy in T steps, and the distribution of its cost. Both are undiscounted."""
 

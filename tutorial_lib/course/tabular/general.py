@@ -1,4 +1,7 @@
-"""Values for a general convex f (eq. 9; IDQL, Hansen-Estruch et al. 2023): V minimises E_mu f(Q - V)."""
+"""Values for a convex f with f'(0) = 0: V minimises E_mu f(Q - V) (eq. 9; IDQL, Hansen-Estruch et al. 2023).
+
+An f with a kink at 0 will do, too, if 0 lies between its slopes on both sides: that of quantiles.
+"""
 
 from collections.abc import Callable
 
