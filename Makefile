@@ -45,7 +45,7 @@ course: $(READY) $(EXECUTED)
 	@rm -rf build/pages/data && mkdir build/pages/data && ln -sfn ../../tutorial_lib ../../benchmarks build/pages
 	@ln -s $(patsubst %,../../../%,$(filter-out data/README.md,$(wildcard data/*))) build/pages/data
 	@cp data/README.md build/pages/data && cp site/*.md build/pages
-	@$(BIN) -m sphinx -q -W --keep-going -c site build/pages build/site
+	@$(BIN) -m sphinx -q -W --keep-going -d build/doctrees -c site build/pages build/site
 	@echo "The course lies at $(CURDIR)/build/site/index.html: open it in a browser."
 
 # Beside links to what the notebooks' own links lead to, as the site.
@@ -75,11 +75,11 @@ notebooks: $(EXECUTED)
 # The kernel warns at every start that it talks in plain text, unless it need not.
 QUIETLY := --log-level=ERROR --KernelManager.transport_encryption=auto
 
-# A notebook runs in its own folder. What stays of it: outputs and counts, and no trace of the machine. A cell
-# that takes ten minutes hangs.
+# A notebook runs in its own folder. Its sliders write the pictures with which they move on the site. What
+# stays of it: outputs and counts, and no trace of the machine. A cell that takes ten minutes hangs.
 build/pages/%.ipynb: %.ipynb $(WHAT_NOTEBOOKS_USE) $(READY)
-	@mkdir -p $(@D)
-	@printf '%-50s' $<; start=$$(date +%s); \
+	@mkdir -p $(@D) && rm -rf build/pages/pictures/$(*F)
+	@printf '%-50s' $<; start=$$(date +%s); C2IQL_PICTURES=$(CURDIR)/build/pages/pictures/$(*F) \
 	$(BIN) -m nbconvert $(QUIETLY) --ExecutePreprocessor.timeout=600 --to notebook --execute --output-dir $(@D) $< && \
 	$(BIN) -m nbstripout --keep-output --keep-count --keep-id --extra-keys metadata.language_info $@ && \
 	echo "$$(($$(date +%s) - start)) s"

@@ -5,6 +5,7 @@ import importlib
 import json
 import pkgutil
 import re
+import shutil
 import sys
 from binascii import a2b_base64
 from pathlib import Path
@@ -12,12 +13,14 @@ from pathlib import Path
 from docutils import nodes
 from markdown_it import MarkdownIt
 from sphinx.application import Sphinx
+from sphinx.util import logging
 
 import tutorial_lib
 
 sys.path.insert(0, str(Path(__file__).parent))
 import algorithms  # noqa: E402
 from marks import remove_marks  # noqa: E402
+from moving import replace_widgets  # noqa: E402
 
 project = "Safe offline reinforcement learning with C2IQL"
 html_title = project
@@ -31,16 +34,18 @@ nb_merge_streams = True
 nb_render_markdown_format = "myst"  # the default, plain CommonMark, has no tables
 nb_code_prompt_show = "Show a solution"  # only solutions are folded
 nb_code_prompt_hide = "Hide it"
-nb_ipywidgets_js = {}  # sliders need a running kernel, and their scripts need the network
+nb_ipywidgets_js = {}  # widgets need a running kernel, and their scripts need the network
 myst_enable_extensions = ["dollarmath", "amsmath"]
 myst_heading_anchors = 3  # pages have links to their own sections
 autodoc_member_order = "bysource"
 add_module_names = False  # the page's title has the module's name
 
 DESCRIPTIONS: dict[str, str] = {}  # of the images in notebooks: by the SHA-256 hash of a PNG file, its text
+LARGEST_SITE = 80_000_000  # bytes
 
 html_theme = "furo"
-html_static_path = html_css_files = ["style.css"]
+html_css_files, html_js_files = ["style.css"], ["moving.js"]
+html_static_path = html_css_files + html_js_files
 html_copy_source = False
 
 
@@ -49,6 +54,7 @@ def setup(app: Sphinx) -> None:
     app.connect("builder-inited", write_reference_pages)
     app.connect("source-read", finish_page)
     app.connect("doctree-read", describe_images)
+    app.connect("build-finished", copy_pictures)
     app.connect("autodoc-process-docstring", read_docstring_as_markdown)
 
 
@@ -82,19 +88,20 @@ def first_paragraph(module: str) -> str:
 def finish_page(app: Sphinx, docname: str, source: list[str]) -> None:
     """Change the text of a page, `source[0]`, before Sphinx reads it.
 
-    Notebooks lose the comments for machines. Their sliders lose the widgets' views, so that their text is
-    shown. What their images show is kept for `describe_images`. The first page gets its table of contents.
+    Notebooks lose the comments for machines. Their sliders become pictures that move. What their images show
+    is kept for `describe_images`. The first page gets its table of contents.
     """
     if docname.startswith("notebooks/"):
         notebook = json.loads(source[0])
         remove_marks(notebook)
+        name = docname.removeprefix("notebooks/")
+        replace_widgets(notebook, Path(app.srcdir, "pictures", name), f"../pictures/{name}")
         for cell in notebook["cells"]:
             for output in cell.get("outputs", []):
                 data = output.get("data", {})
-                data.pop("application/vnd.jupyter.widget-view+json", None)
                 if "image/png" in data:
-                    name = hashlib.sha256(a2b_base64("".join(data["image/png"]))).hexdigest()
-                    DESCRIPTIONS[name] = output["metadata"].get("image/png", {}).get("alt", "A figure.")
+                    stem = hashlib.sha256(a2b_base64("".join(data["image/png"]))).hexdigest()
+                    DESCRIPTIONS[stem] = output["metadata"].get("image/png", {}).get("alt", "A figure.")
         source[0] = json.dumps(notebook)
     if docname == "index":
         source[0] = source[0].replace("CONTENTS", contents(Path(app.srcdir)))
@@ -109,6 +116,18 @@ def describe_images(app: Sphinx, doctree: nodes.document) -> None:
         text = DESCRIPTIONS.get(Path(image["uri"]).stem)
         if text:
             image["alt"] = text
+
+
+def copy_pictures(app: Sphinx, exception: Exception | None) -> None:
+    """Copy the pictures of all controls to the site. Warns of a site that has grown too large."""
+    pictures = Path(app.srcdir, "pictures")
+    if exception or not pictures.is_dir():
+        return
+    shutil.copytree(pictures, Path(app.outdir, "pictures"), dirs_exist_ok=True)
+    files = (path for path in Path(app.outdir).rglob("*") if not path.is_relative_to(app.doctreedir))
+    size = sum(path.stat().st_size for path in files if path.is_file())
+    if size > LARGEST_SITE:
+        logging.getLogger(__name__).warning("the site has %d bytes, more than %d", size, LARGEST_SITE)
 
 
 def contents(folder: Path) -> str:

@@ -74,8 +74,15 @@ def bindings(source: str) -> dict[str, str]:
 
 
 def is_open(source: str) -> bool:
-    """Returns whether a `...` stands where a statement, an assigned value or a returned value belongs."""
+    """Returns whether a `...` stands in place of a statement, or in an assigned or returned value."""
     statements = [node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.stmt)]
-    values = [getattr(statement, "value", None) for statement in statements]
-    parts = [part for value in values for part in (value.elts if isinstance(value, ast.Tuple) else [value])]
-    return any(isinstance(part, ast.Constant) and part.value is ... for part in parts)
+    return any(_is_placeholder(getattr(statement, "value", None)) for statement in statements)
+
+
+def _is_placeholder(value: ast.expr | None) -> bool:
+    """Returns whether an expression is `...`, or a tuple, list or dictionary that has one."""
+    if isinstance(value, ast.Tuple | ast.List):
+        return any(map(_is_placeholder, value.elts))
+    if isinstance(value, ast.Dict):
+        return any(map(_is_placeholder, value.values))
+    return isinstance(value, ast.Constant) and value.value is ...

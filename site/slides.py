@@ -13,6 +13,7 @@ from pathlib import Path
 
 import nbformat
 from marks import remove_marks
+from moving import replace_widgets
 from nbconvert import SlidesExporter
 from nbconvert.preprocessors import CoalesceStreamsPreprocessor
 
@@ -37,14 +38,13 @@ def exporter() -> SlidesExporter:
 
 
 def convert(path: Path) -> str:
-    """The slides of one notebook, as HTML."""
+    """The slides of one notebook, as HTML. Pictures of controls are in a folder beside the notebook's."""
     notebook = nbformat.read(path, as_version=4)
     remove_marks(notebook)
+    replace_widgets(notebook, path.parent.parent / "pictures" / path.stem, f"pictures/{path.stem}")
     for cell in notebook.cells:
         if cell.cell_type == "markdown":
             cell.source = cell.source.replace(".ipynb)", ".html)")
-        for output in cell.get("outputs", []):  # no slider works here: its text is shown instead
-            output.get("data", {}).pop("application/vnd.jupyter.widget-view+json", None)
     page, _ = exporter().from_notebook_node(notebook, {"metadata": {"name": title_of(notebook)}})
     return page
 
@@ -68,12 +68,15 @@ def copy_scripts(target: Path) -> None:
         for source, name in files.items():
             shutil.copyfile(folder / source, target / name)
     shutil.copyfile(HERE / "pages.js", target / "pages.js")
+    shutil.copyfile(HERE.parent / "moving.js", target / "moving.js")
     shutil.copyfile(HERE / "course.css", target / "dist" / "theme" / "course.css")
 
 
 def main(source: Path, target: Path) -> None:
     """Write the slides of all notebooks in `source`, their scripts, and a page of contents to `target`."""
     copy_scripts(target / "scripts")
+    if (source.parent / "pictures").is_dir():
+        shutil.copytree(source.parent / "pictures", target / "pictures", dirs_exist_ok=True)
     titles = {}
     for path in sorted(source.glob("[0-9]*.ipynb")):
         name = path.with_suffix(".html").name

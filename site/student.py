@@ -7,6 +7,7 @@ notebook runs to its end whatever is still to be written. An exercise stays as i
 
 import ast
 import json
+import re
 import shutil
 import sys
 from pathlib import Path
@@ -17,6 +18,7 @@ from marks import END_SOLUTION, is_answer, is_solution, remove_marks
 from nbformat.v4 import new_code_cell
 
 HERE = Path(__file__).parent
+EXERCISE = re.compile(r"^## Exercise .*(?:\n+\*Grade: (?P<grade>\w+))?", re.MULTILINE)
 GO_ON = "from exercises import go_on\n\ngo_on({notebook!r}, {number})"
 
 
@@ -24,14 +26,18 @@ def without_solutions(notebook: nbformat.NotebookNode, name: str) -> list[tuple[
     """Makes a notebook the students' in place, and returns the code of its exercises and their solutions.
 
     `name` is the notebook's in exercises.json. The exercise of a solution is the last code cell since the
-    previous solution that leaves something to write. Raises ValueError for a solution without an end or an
-    exercise.
+    exercise's heading that leaves something to write. An open-ended exercise may have none; its solution only
+    goes. Raises ValueError for another solution without an exercise, and for one without an end.
     """
-    since, kept, pairs = [], [], []
+    since, kept, pairs, grade = [], [], [], "check"
     for cell in notebook.cells:
         if is_answer(cell):
             continue
+        if cell.cell_type == "markdown" and (found := EXERCISE.search(cell.source)):
+            since, grade = [], found["grade"] or "check"
         if is_solution(cell):
+            if grade == "research" and not since:
+                continue
             exercise = _exercise(since, cell).source
             pairs.append((exercise, _answer(exercise, cell.source)))
             source = GO_ON.format(notebook=name, number=len(pairs))

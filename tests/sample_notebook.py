@@ -2,10 +2,16 @@
 
 import base64
 import io
+from pathlib import Path
 
+import ipywidgets
+from moving import WIDGET
 from nbformat import NotebookNode
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook, new_output
 from PIL import Image
+
+from tutorial_lib.course.pictures import store_pictures
+from tutorial_lib.style import described, one_figure, subplots
 
 FIRST = """# 99 · Sample
 
@@ -37,6 +43,7 @@ def picture(colour: str, text: str | None) -> NotebookNode:
 def sample() -> NotebookNode:
     """The notebook, with outputs as if it had been executed."""
     solution = "# SOLUTION\na = 3 / 4\nshow(a)\n# END SOLUTION"
+    slider = new_output("display_data", {WIDGET: {}, "text/plain": "(Run the notebook for sliders: limit.)"})
     printed = new_output("stream", name="stdout", text="OK  a is right\n")
     shown = [picture("red", 'A "red" square.'), picture("blue", "A blue square."), picture("green", None)]
     cells = [
@@ -51,6 +58,22 @@ def sample() -> NotebookNode:
             execution_count=3,
             metadata={"tags": ["hide-cell"]},
         ),
+        new_code_cell("slider()", outputs=[slider], execution_count=4),
     ]
     kernel = {"kernelspec": {"display_name": "Python 3", "language": "python", "name": "python3"}}
     return new_notebook(cells=cells, metadata=kernel)
+
+
+@one_figure
+def draw(limit, start):
+    """A bar for each of two numbers."""
+    figure, ax = subplots(figsize=(12, 5))
+    ax.bar(["limit", "start"], [limit, start])
+    return described(figure, f"Two bars: limit {limit}, start {start:g}.")
+
+
+def store_sample_pictures(folder: Path) -> None:
+    """The pictures of the notebook's only control, which has two sliders of three and of five values."""
+    limits = ipywidgets.IntSlider(5, 0, 10, 5, description="limit")
+    starts = ipywidgets.FloatSlider(0.25, min=0, max=1, step=0.25, description="start")
+    store_pictures(draw, {"limit": limits, "start": starts}, folder)

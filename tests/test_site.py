@@ -9,7 +9,7 @@ from urllib.parse import unquote
 
 import nbformat
 import pytest
-from sample_notebook import sample
+from sample_notebook import sample, store_sample_pictures
 
 from tutorial_lib.agents import ALGORITHMS, slug
 from tutorial_lib.options import describe
@@ -25,6 +25,7 @@ def site(tmp_path_factory):
     pages, built = (tmp_path_factory.mktemp(name) for name in ("pages", "site"))
     shutil.copytree(ROOT / "notebooks", pages / "notebooks", ignore=shutil.ignore_patterns(".*"))
     nbformat.write(sample(), pages / "notebooks" / "99_sample.ipynb")
+    store_sample_pictures(pages / "pictures" / "99_sample" / "0")
     for folder in ("tutorial_lib", "benchmarks"):
         (pages / folder).symlink_to(ROOT / folder)
     (pages / "data").mkdir()
@@ -133,7 +134,36 @@ def test_a_solution_is_folded_with_all_that_it_shows(sample_page):
 
 def test_an_image_has_the_text_that_its_figure_stored(sample_page):
     texts = sample_page.locator("article img").evaluate_all("images => images.map(image => image.alt)")
-    assert texts == ['A "red" square.', "A blue square.", "A figure.", "A black square."]
+    assert texts == [
+        'A "red" square.',
+        "A blue square.",
+        "A figure.",
+        "A black square.",
+        "Two bars: limit 5, start 0.25.",
+    ]
+
+
+@pytest.mark.parametrize("width", [1280, 390])
+def test_a_key_moves_a_slider_and_its_picture_without_a_kernel(sample_page, width):
+    sample_page.set_viewport_size({"width": width, "height": 900})
+    limit, start = sample_page.locator(".moving input").all()
+    picture, number = sample_page.locator(".moving img"), sample_page.locator(".moving output")
+    first = picture.get_attribute("src")
+    for slider, key, text in (
+        (limit, "ArrowRight", "limit 10, start 0.25"), (start, "End", "limit 10, start 1"),
+        (limit, "Home", "limit 0, start 1"), (start, "ArrowLeft", "limit 0, start 0.75"),
+    ):  # fmt: skip
+        before = picture.get_attribute("src")
+        slider.focus()
+        sample_page.keyboard.press(key)
+        assert picture.get_attribute("alt") == f"Two bars: {text}." and picture.get_attribute("src") != before
+        assert picture.evaluate("image => image.decode().then(() => image.naturalWidth)") > 500
+    assert number.all_inner_texts() == ["0", "0.75"] and start.get_attribute("aria-valuetext") == "0.75"
+    limit.press("ArrowRight")
+    start.press("ArrowLeft")
+    start.press("ArrowLeft")
+    assert picture.get_attribute("src") == first
+    assert sample_page.evaluate("document.documentElement.scrollWidth") <= width
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)

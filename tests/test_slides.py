@@ -8,7 +8,7 @@ import nbformat
 import pytest
 import slides
 from marks import LINES, remove_marks
-from sample_notebook import sample
+from sample_notebook import sample, store_sample_pictures
 
 NOTEBOOKS = sorted(Path(__file__).parents[1].glob("notebooks/[0-9]*.ipynb"))
 
@@ -88,17 +88,40 @@ def test_every_page_fits_its_screen(made, path, browser):
     assert formulas > 0 and len(pages) >= 10
 
 
-def test_an_answer_and_a_solution_stand_on_pages_of_their_own(tmp_path, browser):
-    nbformat.write(sample(), tmp_path / "99_sample.ipynb")
-    slides.main(tmp_path, tmp_path)
+@pytest.fixture
+def sample_page(tmp_path, browser):
+    (tmp_path / "notebooks").mkdir()
+    nbformat.write(sample(), tmp_path / "notebooks" / "99_sample.ipynb")
+    store_sample_pictures(tmp_path / "pictures" / "99_sample" / "0")
+    slides.main(tmp_path / "notebooks", tmp_path / "slides")
     page = browser.new_page(viewport={"width": 1280, "height": 720})
-    page.goto((tmp_path / "99_sample.html").as_uri())
+    page.goto((tmp_path / "slides" / "99_sample.html").as_uri())
     page.wait_for_selector("body[data-pages]")
+    yield page
+    page.close()
+
+
+def test_a_key_moves_a_slider_and_turns_no_page(sample_page):
+    sample_page.evaluate("Reveal.slide(0, Reveal.getTotalSlides() - 1)")
+    picture = sample_page.locator(".moving img")
+    before = picture.get_attribute("src"), sample_page.url
+    sample_page.evaluate("while (Reveal.availableFragments().next) Reveal.next()")
+    slider = sample_page.locator(".moving input").first
+    slider.wait_for(state="visible")
+    sample_page.wait_for_timeout(500)  # it fades in
+    slider.focus()
+    sample_page.keyboard.press("ArrowRight")
+    assert picture.get_attribute("alt") == "Two bars: limit 10, start 0.25."
+    assert picture.get_attribute("src") != before[0] and sample_page.url == before[1]
+    assert picture.evaluate("image => image.decode().then(() => image.naturalWidth)") > 500
+
+
+def test_an_answer_and_a_solution_stand_on_pages_of_their_own(sample_page):
+    page = sample_page
     pages = page.locator(".slides > section > section")
     texts = pages.evaluate_all("pages => pages.map(page => page.textContent)")
     images = page.locator(".slides img").evaluate_all("images => images.map(image => image.alt)")
     formulas = pages.evaluate_all("pages => pages.map(page => page.querySelectorAll('mjx-container').length)")
-    page.close()
     (answer,) = [n for n, text in enumerate(texts) if "three quarters" in text]
     assert texts[answer].strip().startswith("99 · SampleAnswer") and formulas[answer] == 2
     assert not any(code in texts[answer] for code in ("show_all", "a = ..."))
