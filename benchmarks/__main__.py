@@ -1,4 +1,7 @@
-"""`python -m benchmarks` from the project's folder measures how fast this machine trains and simulates."""
+"""`python -m benchmarks` from the project's folder measures how fast this machine trains and simulates.
+
+`python -m benchmarks reliability` tries to break the commands (see `benchmarks.reliability`).
+"""
 
 import sys
 
@@ -66,6 +69,11 @@ def show(task: Task, workers: int | None, rounds: int, device: Device) -> None:
 
 if __name__ == "__main__":
     try:
-        tyro.cli(main, prog="python -m benchmarks")
+        if sys.argv[1:2] == ["reliability"]:
+            from benchmarks import reliability
+
+            reliability.command(sys.argv[2:])
+        else:
+            tyro.cli(main, prog="python -m benchmarks")
     except (ValueError, OSError) as error:
         sys.exit(f"benchmarks: {error}")

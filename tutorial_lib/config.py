@@ -26,6 +26,16 @@ NOT_NEGATIVE = Bound(lambda x: x >= 0, "0 or more")
 COUNT = Bound(lambda x: x >= 1, "1 or more")
 PAIR = Bound(lambda x: x >= 2, "2 or more")
 
+LARGEST = {
+    "updates": 100_000_000, "crm_steps": 100_000_000, "warm_up": 100_000_000,
+    "batch_size": 65_536, "hidden_width": 8_192, "hidden_layers": 64, "crm_width": 8_192, "crm_layers": 64,
+}  # fmt: skip
+"""The largest values of options that are whole numbers. They hold whatever the algorithm, and are far above
+what anybody trains with: a slip of the keyboard must not take all memory, or all time."""
+MANY = 1_000
+"""The largest value of every other whole number. Such options count networks, heads, samples or tokens."""
+LARGEST_FLOAT32 = 3.4e38
+
 PROFILES = ("paper", "small")
 """Two sets of defaults: `paper` has the sizes of the paper, and `small` trains in minutes on a laptop."""
 
@@ -119,3 +129,7 @@ def _check(name: str, hint: Any, value: Any) -> None:
     for bound in bounds:
         if not bound.holds(value):
             raise ValueError(f"{name} is {value}, and must be {bound.words}")
+    if int in kinds and value > (most := LARGEST.get(name, MANY)):
+        raise ValueError(f"{name} is {value}, and must be at most {most:,}")
+    if float in kinds and not abs(value) <= LARGEST_FLOAT32:
+        raise ValueError(f"{name} is {value}, and must be a finite number of float32")

@@ -2,6 +2,8 @@
 
 import contextlib
 import datetime
+import functools
+import hashlib
 import json
 import os
 import re
@@ -17,23 +19,50 @@ from safetensors import SafetensorError
 
 LOCK, HOLDER = ".lock", ".lock.json"
 """The files of a folder that is locked: the lock of the operating system, and who has it since when."""
-TEMPORARY = re.compile(r"\..+\.[0-9a-f]{32}\.tmp")
-"""The names of the temporary files of `written_whole`."""
+TEMPORARY = re.compile(r"\.(.+)\.([0-9a-f]{8})([0-9a-f]{8})[0-9a-f]{16}\.tmp")
+"""The names of the temporary files of `written_whole`: of which file, of which machine and which process."""
+
+
+@functools.cache
+def _machine() -> str:
+    """Returns 8 digits for this machine. Containers that do not see each other's processes differ."""
+    name = socket.gethostname()
+    with contextlib.suppress(OSError):
+        name += os.readlink("/proc/self/ns/pid")
+    return hashlib.sha256(name.encode()).hexdigest()[:8]
 
 
 def _temporary(path: Path) -> Path:
     """Returns the name of a new temporary file beside `path`. It is unique, also among several machines."""
-    return path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")
+    return path.with_name(f".{path.name}.{_machine()}{os.getpid():08x}{uuid.uuid4().hex[:16]}.tmp")
+
+
+def _was_killed(digits: re.Match) -> bool:
+    """Returns whether the process that made a temporary file ran on this machine and runs no longer."""
+    import psutil
+
+    return digits[2] == _machine() and not psutil.pid_exists(int(digits[3], 16))
+
+
+def _remove_halves(path: Path) -> None:
+    """Removes what killed processes had written of the file `path`."""
+    with contextlib.suppress(OSError):  # whoever may not look into the folder may still write there
+        for half in path.parent.glob(".*.tmp"):
+            digits = TEMPORARY.fullmatch(half.name)
+            if digits and digits[1] == path.name and _was_killed(digits):
+                half.unlink(missing_ok=True)
 
 
 @contextlib.contextmanager
 def written_whole(path: Path) -> Iterator[Path]:
     """Yields a temporary path to write to. It replaces `path` when the block ends without an error.
 
-    A reader finds the whole old file or the whole new file, also after a crash. Missing folders are made.
-    Raises OSError where there is no space or no permission.
+    A reader finds the whole old file or the whole new file, also after a crash. Missing folders are made, and
+    what killed processes had written of this file is removed. Raises OSError where there is no space or no
+    permission.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
+    _remove_halves(path)
     temporary = _temporary(path)
     try:
         yield temporary
@@ -136,13 +165,13 @@ def _by_whom(holder: dict[str, Any]) -> str:
 def sweep(folder: Path) -> None:
     """Removes the temporary files in a folder that killed processes left.
 
-    A table of results that is younger than an hour is left: `evaluate` writes it beside an agent without the
-    folder's lock.
+    A table that is younger than an hour is left unless its process is known to be dead: `evaluate` writes
+    tables beside an agent without the folder's lock.
     """
     for path in folder.glob(".*.tmp"):
         with contextlib.suppress(FileNotFoundError):
-            young = time.time() - path.stat().st_mtime < 3600
-            if TEMPORARY.fullmatch(path.name) and not (young and ".csv." in path.name):
+            digits, young = TEMPORARY.fullmatch(path.name), time.time() - path.stat().st_mtime < 3600
+            if digits and not (young and ".csv." in path.name and not _was_killed(digits)):
                 path.unlink()
 
 

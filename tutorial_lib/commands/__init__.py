@@ -3,16 +3,78 @@
 The modules here import the other modules of the library when a command runs, so that `c2iql --help` is fast.
 """
 
-from typing import Literal
+import os
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Literal
+
+if TYPE_CHECKING:
+    import tutorial_lib.config
+    from tutorial_lib.agents import Agent
+    from tutorial_lib.tasks import Task
 
 Device = Literal["cpu", "cuda"]
 
+MOST = {
+    "episodes": 1_000_000,
+    "steps": 1_000_000_000,
+    "rounds": 1_000,
+    "workers": max(8, 4 * (os.cpu_count() or 1)),  # a worker takes some 300 MB
+}
+"""The largest number that a command takes. It is far above what anybody needs: a slip of the keyboard must
+not take all memory, or all time."""
+COPIES = 6
+"""How often a trained number is in memory: itself, its gradient, Adam's two moments, and its target network,
+with some room for the batch."""
+
 
 def check_counts(**numbers: int | None) -> None:
-    """Raises ValueError where a number is less than 1. None is allowed."""
+    """Raises ValueError where a number is less than 1, or larger than in `MOST`. None is allowed."""
     for name, number in numbers.items():
         if number is not None and number < 1:
             raise ValueError(f"--{name} {number}: must be 1 or more")
+        if number is not None and number > MOST[name]:
+            raise ValueError(f"--{name} {number}: must be at most {MOST[name]:,}")
+
+
+def check_memory(
+    kind: "type[Agent]",
+    task: "Task",
+    config: "tutorial_lib.config.Config",  # a page of the site links to it, and "Config" alone is ambiguous
+    seeds: Sequence[int],
+    limits: Sequence[float] | None,
+) -> None:
+    """Raises ValueError where training these runs together would take more memory than is free.
+
+    Each run has a seed, and a limit if `limits` is not None. The parameters of one run are counted on the
+    device `meta`, where they take no memory.
+    """
+    import psutil
+    import torch
+    from torch.nn.modules.module import register_module_parameter_registration_hook
+
+    made = 0
+
+    def count(module: torch.nn.Module, name: str, parameter: torch.nn.Parameter | None) -> None:
+        nonlocal made
+        made += 0 if parameter is None else parameter.numel()
+
+    def build_one(agent: "Agent") -> None:
+        agent.build()
+        agent.parameters, agent.target_parameters = {}, {}
+
+    outline = type("Outline", (kind,), {"build_runs": build_one})
+    handle = register_module_parameter_registration_hook(count)
+    try:
+        with torch.device("meta"):
+            outline(task, config, seeds[:1], limits and limits[:1], "meta")
+    finally:
+        handle.remove()
+    needed, free = 4 * COPIES * made * len(seeds), psutil.virtual_memory().available
+    if needed > free:
+        raise ValueError(
+            f"{kind.name}: these options need {needed / 1e9:,.1f} GB of memory for {len(seeds)} run(s), "
+            f"and {free / 1e9:,.1f} GB are free: choose fewer seeds or limits, or smaller networks"
+        )
 
 
 def check_device(device: Device) -> Device:

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import tyro
 
-from tutorial_lib.commands import check_counts, check_device, check_limits
+from tutorial_lib.commands import check_counts, check_device, check_limits, check_memory
 
 
 def train(words: tuple[str, ...] = ()) -> None:
@@ -23,17 +23,18 @@ def train(words: tuple[str, ...] = ()) -> None:
 
     kind, args = parse_training(list(words))
     task = get_task(args.task)
-    limits = args.limits or task.thresholds
     if args.limits and not kind.needs_limit:
         raise ValueError(f"--limits: {kind.name} is trained for no limit; it is told one when it plays")
     if not args.seeds:
         raise ValueError("--seeds: give at least one")
     if not all(0 <= seed < 2**63 for seed in args.seeds):
         raise ValueError("--seeds: each must be from 0 to 2^63 - 1")
-    pairs = [(seed, limit) for limit in (limits if kind.needs_limit else (None,)) for seed in args.seeds]
     device = check_device(args.device)
-    seeds, of_runs = zip(*pairs, strict=True)
-    agent = kind(task, args.config, seeds, of_runs if kind.needs_limit else None, device)
+    limits = (args.limits or task.thresholds) if kind.needs_limit else ()
+    of_runs = tuple(limit for limit in limits for _ in args.seeds) or None
+    seeds = args.seeds * (len(limits) or 1)
+    check_memory(kind, task, args.config, seeds, of_runs)
+    agent = kind(task, args.config, seeds, of_runs, device)
     suffix = "".join(f"-{limit:g}" for limit in args.limits)
     out = args.out or Path("runs") / task.name / f"{slug(kind.name)}{suffix}-{args.config.profile}"
     with held(out):

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from tutorial_lib.commands import check_counts
+from tutorial_lib.commands import check_counts, check_memory
 
 if TYPE_CHECKING:
     from tutorial_lib.studies.runs import Runs
@@ -87,12 +87,18 @@ def _run_entries(
 ) -> None:
     """Runs the chosen entries and writes the results of the whole study.
 
-    Raises ValueError where an entry failed.
+    Raises ValueError where an entry needs more memory than is free, and where one failed.
     """
+    from tutorial_lib.agents import get_algorithm
     from tutorial_lib.files import check_output
     from tutorial_lib.studies import cluster, results
     from tutorial_lib.studies.runs import collect as gather
+    from tutorial_lib.tasks import get_task
 
+    for entry in chosen:
+        seeds, limits = zip(*entry.pairs, strict=True)
+        of_runs = limits if entry.trained_for else None
+        check_memory(get_algorithm(entry.algorithm), get_task(entry.task), entry.config, seeds, of_runs)
     out = out or (folder.parent if trial else results.RESULTS) / f"{folder.name}.csv"
     for path in (out, folder / "entry.csv"):
         check_output(path)
@@ -102,8 +108,8 @@ def _run_entries(
         failures = cluster.run_all(chosen, folder, client)
     done = gather(whole, folder, out, keep=not trial)
     print(f"{out}: {done} of {len(whole)} entries are finished here")
-    for entry, reason in failures.items():
-        print(f"FAILED {entry}: {reason}")
+    for name, reason in failures.items():
+        print(f"FAILED {name}: {reason}")
     if failures:
         some = f"{len(failures)} of {len(chosen)} entries failed"
         raise ValueError(f"{some}; run the study again to try them again")
