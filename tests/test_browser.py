@@ -26,7 +26,7 @@ CELLS = """() => window.jupyterapp.shell.currentWidget.content.model.sharedModel
     .map(cell => [cell.execution_count, cell.outputs.map(output => output.output_type)])"""
 END_KERNEL = "window.jupyterapp.shell.currentWidget.sessionContext.shutdown()"
 ERRORS = "[data-mime-type='application/vnd.jupyter.error'], [data-mime-type='application/vnd.jupyter.stderr']"
-NOTEBOOKS = sorted(ROOT.glob("notebooks/[0-9]*.ipynb"))
+NOTEBOOKS = [path for path in sorted(ROOT.glob("notebooks/[0-9]*.ipynb")) if WIDGET in path.read_text()]
 
 
 @pytest.fixture(scope="module")
