@@ -79,7 +79,7 @@ QUIETLY := --log-level=ERROR --KernelManager.transport_encryption=auto
 # stays of it: outputs and counts, and no trace of the machine. A cell that takes ten minutes hangs.
 build/pages/%.ipynb: %.ipynb $(WHAT_NOTEBOOKS_USE) $(READY)
 	@mkdir -p $(@D) && rm -rf build/pages/pictures/$(*F)
-	@printf '%-50s' $<; start=$$(date +%s); C2IQL_PICTURES=$(CURDIR)/build/pages/pictures/$(*F) \
+	@printf '%-50s' $<; start=$$(date +%s); C2IQL_PICTURES="$(CURDIR)/build/pages/pictures/$(*F)" \
 	$(BIN) -m nbconvert $(QUIETLY) --ExecutePreprocessor.timeout=600 --to notebook --execute --output-dir $(@D) $< && \
 	$(BIN) -m nbstripout --keep-output --keep-count --keep-id --extra-keys metadata.language_info $@ && \
 	echo "$$(($$(date +%s) - start)) s"

@@ -48,19 +48,29 @@ def test_follow_agrees_with_values_by_recursion():
     assert found.chances[0, 0] == pytest.approx(1)
 
 
+def played(cmdp, choose, n, rng):
+    """The cost and the reward of n episodes of 100 steps, with the actions `choose(t, spent, state)`."""
+    state = draw(np.tile(cmdp.initial, (n, 1)), rng)
+    spent, earned = np.zeros((2, n))
+    for t in range(100):
+        action = choose(t, spent, state)
+        spent, earned = spent + cmdp.costs[state, action], earned + cmdp.rewards[state, action]
+        state = draw(cmdp.transitions[state, action], rng)
+    return spent, earned
+
+
 def test_the_rule_agrees_with_played_episodes():
     """A loop over steps that asks for the nearest threshold in words of its own."""
     rng, cmdp, n, limit = np.random.default_rng(1), tabular.laps(), 4000, 20
     agent = laps.policies((10, 25, 40))
     found = laps.follow_rule(CONFIG, agent, limit)
-    state = draw(np.tile(cmdp.initial, (n, 1)), rng)
-    spent, earned = np.zeros((2, n))
-    for t in range(100):
+
+    def choose(t, spent, state):
         budget = (limit - spent) * 100 / (100 - t)
         told = np.where(budget < 17.5, 10, np.where(budget < 32.5, 25, 40))
-        action = draw(np.stack([agent[b][s] for b, s in zip(told, state, strict=True)]), rng)
-        spent, earned = spent + cmdp.costs[state, action], earned + cmdp.rewards[state, action]
-        state = draw(cmdp.transitions[state, action], rng)
+        return draw(np.stack([agent[b][s] for b, s in zip(told, state, strict=True)]), rng)
+
+    spent, earned = played(cmdp, choose, n, rng)
     assert found.cost == pytest.approx(spent.mean(), abs=5 * spent.std() / n**0.5)
     assert found.reward == pytest.approx(earned.mean(), abs=5 * earned.std() / n**0.5)
     assert found.exceeds(limit) == pytest.approx((spent > limit).mean(), abs=0.04)
@@ -111,14 +121,13 @@ def test_the_planning_agent_agrees_with_played_episodes(clock):
     rng, cmdp, n, limit = np.random.default_rng(2), tabular.laps(), 4000, 10
     found = laps.follow_plan(limit, price=0.7, clock=clock)
     _, actions = tabular.plan_budget(cmdp, 100, 60, 0.7)
-    state = draw(np.tile(cmdp.initial, (n, 1)), rng)
-    spent, earned = np.zeros((2, n))
-    for t in range(100):
+
+    def choose(t, spent, state):
         left = np.maximum(limit - spent, 0)
         told = np.minimum(np.round(left * 100 / (100 - t)), 60).astype(int)
-        action = actions[t, left.astype(int), state] if clock else actions[0, told, state]
-        spent, earned = spent + cmdp.costs[state, action], earned + cmdp.rewards[state, action]
-        state = draw(cmdp.transitions[state, action], rng)
+        return actions[t, left.astype(int), state] if clock else actions[0, told, state]
+
+    spent, earned = played(cmdp, choose, n, rng)
     assert found.cost == pytest.approx(spent.mean(), abs=5 * spent.std() / n**0.5)
     assert found.reward == pytest.approx(earned.mean(), abs=5 * earned.std() / n**0.5)
     assert found.exceeds(limit) == pytest.approx((spent > limit).mean(), abs=0.04)
@@ -127,13 +136,12 @@ def test_the_planning_agent_agrees_with_played_episodes(clock):
 def test_an_agent_with_every_rate_agrees_with_played_episodes():
     rng, cmdp, n, limit = np.random.default_rng(3), tabular.laps(), 4000, 10
     agent = laps.policies(range(61))
-    state = draw(np.tile(cmdp.initial, (n, 1)), rng)
-    spent, earned = np.zeros((2, n))
-    for t in range(100):
+
+    def choose(t, spent, state):
         told = np.clip(np.round((limit - spent) * 100 / (100 - t)), 0, 60)
-        action = draw(np.stack([agent[b][s] for b, s in zip(told, state, strict=True)]), rng)
-        spent, earned = spent + cmdp.costs[state, action], earned + cmdp.rewards[state, action]
-        state = draw(cmdp.transitions[state, action], rng)
+        return draw(np.stack([agent[b][s] for b, s in zip(told, state, strict=True)]), rng)
+
+    spent, earned = played(cmdp, choose, n, rng)
     found = laps.follow_any_rate(limit)
     assert found.cost == pytest.approx(spent.mean(), abs=5 * spent.std() / n**0.5)
     assert found.reward == pytest.approx(earned.mean(), abs=5 * earned.std() / n**0.5)

@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
-from torch.nn.modules.module import register_module_parameter_registration_hook
 
 from tutorial_lib.agents import Agent, get_algorithm
 from tutorial_lib.config import Config
@@ -28,8 +27,6 @@ NEWER_OPTIONS: dict[str, Any] = {
     "clock": False, "price_unit": "return", "evaluated_critic": "highest", "evaluators": 0, "tell": "left",
 }  # fmt: skip
 """The options that the shipped agents' files do not name yet, and what these agents were trained with."""
-LARGEST_OPTION = 100_000_000
-"""No option that is a whole number is larger in the file of an agent."""
 DAMAGED = (
     OSError,
     SafetensorError,
@@ -161,9 +158,6 @@ def _parsed(metadata: dict[str, str]) -> Header:
     options = {name: value for name, value in NEWER_OPTIONS.items() if name in own} | options
     if odd := sorted(own ^ set(options)):  # a default in a missing option's place might not be what it was
         raise ValueError(f"these options are missing or unknown: {', '.join(map(repr, odd))}")
-    for name, value in options.items():
-        if isinstance(value, int) and abs(value) > LARGEST_OPTION:
-            raise ValueError(f"{name} is {value}")
     if not all(type(seed) is int and 0 <= seed < 2**63 for seed in seeds):
         raise ValueError("seeds must be whole numbers of at most 63 bits")
     if not (
@@ -175,11 +169,7 @@ def _parsed(metadata: dict[str, str]) -> Header:
 
 
 def _check_sizes(header: Header, shapes: dict[str, list[int]]) -> None:
-    """Raises ValueError if the agent of the header is larger than the tensors in its file.
-
-    One run of the agent is built on the device `meta`, which has shapes but no memory. Its parameters are
-    counted as they are made.
-    """
+    """Raises ValueError if the agent of the header is larger than the tensors in its file."""
     runs, room = len(header.seeds), 0
     for name, shape in shapes.items():
         of_runs = name.startswith(("online.", "buffer.", "variable."))
@@ -187,27 +177,10 @@ def _check_sizes(header: Header, shapes: dict[str, list[int]]) -> None:
             raise ValueError(f"{name} has shape {tuple(shape)} for {runs} seeds")
         if of_runs or name.startswith("reconstruction."):
             room += math.prod(shape) // (runs if of_runs else 1)
-    made = 0
-
-    def count(module: torch.nn.Module, name: str, parameter: torch.nn.Parameter | None) -> None:
-        nonlocal made
-        made += 0 if parameter is None else parameter.numel()
-        if made > 2 * room:  # twice, because an algorithm may replace a network of its base class
-            raise ValueError("its networks are larger than the tensors in the file")
-
-    outline = type("Outline", (header.kind,), {"build_runs": _build_outline})
-    handle = register_module_parameter_registration_hook(count)
-    try:
-        with torch.device("meta"):
-            outline(header.task, header.config, header.seeds[:1], header.limits and header.limits[:1], "meta")
-    finally:
-        handle.remove()
-
-
-def _build_outline(agent: Agent) -> None:
-    """Builds the networks of one run and keeps none. It stands in the place of `build_runs`."""
-    agent.build()
-    agent.parameters, agent.target_parameters = {}, {}
+    # Twice, because an algorithm may replace a network of its base class.
+    kind, task, config, seeds, limits, _ = header
+    if kind.count_parameters(task, config, seeds, limits, most=2 * room) > 2 * room:
+        raise ValueError("its networks are larger than the tensors in the file")
 
 
 def _check_names(agent: Agent, tensors: dict[str, torch.Tensor]) -> None:

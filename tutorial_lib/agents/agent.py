@@ -5,13 +5,16 @@ and computes the algorithm's `draw`, `losses` and `step` for all of them (see `s
 course explains is the code that runs.
 """
 
+import contextlib
 import dataclasses
+import math
 from collections.abc import Sequence
 from typing import Any, ClassVar, Self
 
 import numpy as np
 import torch
 from torch import Tensor, nn
+from torch.nn.modules.module import register_module_parameter_registration_hook
 
 from tutorial_lib.agents import lift
 from tutorial_lib.agents.player import Player
@@ -180,6 +183,45 @@ class Agent(Runs):
         is out of its bound.
         """
         return cls.Config.make(profile, None if task is None else task.name).changed(**changes)
+
+    @classmethod
+    def count_parameters(
+        cls,
+        task: Task,
+        config: AnyConfig,
+        seeds: Sequence[int],
+        limits: Sequence[float] | None,
+        most: float = math.inf,
+    ) -> int:
+        """Returns the number of parameters of the first of these runs, without taking memory for them.
+
+        The run is built on the device `meta`, which has shapes but no memory, and its parameters are counted
+        as they are made. If they are more than `most`, the rest is not built, and the count so far is
+        returned.
+        """
+        made = 0
+
+        class Enough(Exception):
+            """There are more than `most` parameters."""
+
+        def count(module: nn.Module, name: str, parameter: nn.Parameter | None) -> None:
+            nonlocal made
+            made += 0 if parameter is None else parameter.numel()
+            if made > most:
+                raise Enough
+
+        def build_one(agent: Agent) -> None:
+            agent.build()
+            agent.parameters, agent.target_parameters = {}, {}
+
+        outline = type("Outline", (cls,), {"build_runs": build_one})
+        handle = register_module_parameter_registration_hook(count)
+        try:
+            with contextlib.suppress(Enough), torch.device("meta"):
+                outline(task, config, seeds[:1], limits and limits[:1], "meta")
+        finally:
+            handle.remove()
+        return made
 
     def draw_all(self, data: Sequence[Batch], generators: Sequence[torch.Generator]) -> dict[str, Tensor]:
         """Returns what `draw` returns for each run, from its own data and generator, stacked: (S, ...)."""

@@ -12,11 +12,10 @@ Departures:
    and an infinite limit enters the networks as 1.5 cost ranges.
 5. In profile `small`, the reconstruction model is trained with more noise (`crm_noise_rate`), because the
    paper's noise is smaller than the critics' error.
-
-The paper leaves points 2 to 4 open. The text of each option says what is known of it.
-
 6. Not in the paper, and off unless they are asked for: `clock`, `thresholds='range'`, a price in units of the
    advantages' spread (`price_unit`), `evaluated_critic='mean'`, and `evaluators` with `tell='predicted'`.
+
+The paper leaves points 2 to 4 open. The text of each option says what is known of it.
 
 Measured: `data/results/table1.csv` and `data/results/ablations.csv`; their tables stand in `data/README.md`,
 with the reasons for the options that some tasks have in profile `small`.
@@ -37,7 +36,6 @@ from tutorial_lib.agents.implicit import ConstrainedAgent, ConstrainedConfig
 from tutorial_lib.agents.player import BudgetPlayer, Player
 from tutorial_lib.agents.seeds import Fields, Networks
 from tutorial_lib.costs.conditioning import after_step, draw_thresholds, encode
-from tutorial_lib.costs.discounting import average_threshold
 from tutorial_lib.costs.reconstruction import (
     CostReconstruction,
     ReconstructionConfig,
@@ -171,7 +169,7 @@ class C2IQL(ConstrainedAgent):
         """
         horizon, gammas = self.task.horizon, self.gammas
         if not self.reconstructs:
-            return q_cost.squeeze(-1) / average_threshold(1.0, self.config.gamma, horizon)  # L~ / L (eq. 2)
+            return super().episode_cost(q_cost)  # Q_c / (L~ / L)
         if self.config.time_limits == "rate":  # the sum has no end: keep the share of the first T steps
             q_cost = q_cost * (1 - gammas**horizon)
         return self.reconstruction(q_cost)

@@ -13,7 +13,7 @@ Departures:
 5. There are two cost critics, and the higher cost counts (`cost_critics`). The paper does not say how many it
    has.
 
-The consequences of departures 2, 4 and 5 were measured on C2IQL, and the file `c2iql.py` has the numbers.
+The consequences of departures 2, 4 and 5 were measured on C2IQL: see `data/README.md`.
 """
 
 import torch
@@ -22,7 +22,6 @@ from torch import Tensor
 from tutorial_lib import losses
 from tutorial_lib.agents.implicit import ConstrainedAgent, ConstrainedConfig
 from tutorial_lib.agents.seeds import Fields, Networks
-from tutorial_lib.costs.discounting import average_threshold
 from tutorial_lib.networks import gaussian_log_prob
 
 
@@ -33,13 +32,6 @@ class CIQL(ConstrainedAgent):
     Config = ConstrainedConfig
     needs_limit = True
     in_table1 = False
-
-    def episode_cost(self, q_cost: Tensor) -> Tensor:
-        """Returns discounted costs (..., 1) divided by L~ / L (eq. 2), (...,), in unsafe steps per episode.
-
-        To compare them with L is to compare Q_c with L~.
-        """
-        return q_cost.squeeze(-1) / average_threshold(1.0, self.config.gamma, self.task.horizon)
 
     def losses(self, net: Networks, batch: Fields) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
         config, a, limit = self.config, batch.actions, batch.limit

@@ -11,6 +11,7 @@ from tutorial_lib import losses
 from tutorial_lib.agents.critic import CriticAgent, CriticConfig, cost_guess, goes_on, reward_guess
 from tutorial_lib.agents.seeds import Fields, Networks, Rates
 from tutorial_lib.config import COUNT, NOT_NEGATIVE, SHARE
+from tutorial_lib.costs.discounting import average_threshold
 from tutorial_lib.data.dataset import Dataset
 from tutorial_lib.networks import Critics, Policy, Value
 
@@ -156,9 +157,10 @@ class ConstrainedAgent(ImplicitAgent):
     def episode_cost(self, q_cost: Tensor) -> Tensor:
         """Returns the cost of a whole episode, (...,), for discounted costs (..., m).
 
-        It is in unsafe steps per episode, like the limit with which it is compared.
+        It is in unsafe steps per episode, like the limit L with which it is compared. By default, it is the
+        only head divided by L~ / L (eq. 2): to compare this with L is to compare Q_c with L~.
         """
-        raise NotImplementedError
+        return q_cost.squeeze(-1) / average_threshold(1.0, self.config.gamma, self.task.horizon)
 
     def evaluated_heads(self, q_cost: Tensor, costs: Tensor) -> Tensor:
         """Returns the heads that V_c learns, (B, m), from those of k critics, (k, B, m).

@@ -80,12 +80,12 @@ class BudgetPlayer(CountingPlayer):
         return told_limit(self.agent.task, config, self.limits, self.spent, self.t, remaining)
 
     def _choose(self, observations: np.ndarray) -> np.ndarray:
-        """Sets and returns the limits that the policy is told at observations (E, obs), (E,)."""
-        self._told = self.left
-        if self.agent.config.tell == "predicted":
-            left = self.limits - self.spent
-            self._told = self.agent.largest_limit(observations, left, self.run, self.t)
-        return self._told
+        """Returns the limits that the policy is told at observations (E, obs), (E,)."""
+        if self.agent.config.tell == "left":
+            return self.left
+        left = self.limits - self.spent
+        self._chosen = self.agent.largest_limit(observations, left, self.run, self.t)
+        return self._chosen
 
     def act(self, observations: np.ndarray) -> np.ndarray:
         return self.agent.act(observations, self._choose(observations), self.run, self.t)
@@ -93,7 +93,7 @@ class BudgetPlayer(CountingPlayer):
     @property
     def told(self) -> np.ndarray:
         """The limit that the policy is told at this step, (E,). With tell='predicted', `act` chooses it."""
-        return self._told if self.agent.config.tell == "predicted" else self.left
+        return self._chosen if self.agent.config.tell == "predicted" else self.left
 
     def predicted_cost(self, observations: np.ndarray) -> np.ndarray:
         return self.agent.predicted_cost(observations, self._choose(observations), self.run, self.t)

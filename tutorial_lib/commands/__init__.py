@@ -45,30 +45,11 @@ def check_memory(
 ) -> None:
     """Raises ValueError where training these runs together would take more memory than is free.
 
-    Each run has a seed, and a limit if `limits` is not None. The parameters of one run are counted on the
-    device `meta`, where they take no memory.
+    Each run has a seed, and a limit if `limits` is not None.
     """
     import psutil
-    import torch
-    from torch.nn.modules.module import register_module_parameter_registration_hook
 
-    made = 0
-
-    def count(module: torch.nn.Module, name: str, parameter: torch.nn.Parameter | None) -> None:
-        nonlocal made
-        made += 0 if parameter is None else parameter.numel()
-
-    def build_one(agent: "Agent") -> None:
-        agent.build()
-        agent.parameters, agent.target_parameters = {}, {}
-
-    outline = type("Outline", (kind,), {"build_runs": build_one})
-    handle = register_module_parameter_registration_hook(count)
-    try:
-        with torch.device("meta"):
-            outline(task, config, seeds[:1], limits and limits[:1], "meta")
-    finally:
-        handle.remove()
+    made = kind.count_parameters(task, config, seeds, limits)
     needed, free = 4 * COPIES * made * len(seeds), psutil.virtual_memory().available
     if needed > free:
         raise ValueError(

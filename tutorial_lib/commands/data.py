@@ -20,9 +20,11 @@ def tasks() -> None:
     columns = (
         "name family horizon obs_dim act_dim gammas thresholds cost_range min_return max_return terminates"
     )
-    rows = [{name: getattr(task, name) for name in columns.split()} for task in all_tasks().values()]
-    for row, simulator in zip(rows, map(simulator_of, all_tasks().values()), strict=True):
-        row["simulator"] = f"not installed: {simulator.remedy}" if simulator.missing() else "installed"
+    rows = []
+    for task in all_tasks().values():
+        simulator = simulator_of(task)
+        state = f"not installed: {simulator.remedy}" if simulator.missing() else "installed"
+        rows.append({name: getattr(task, name) for name in columns.split()} | {"simulator": state})
     print(pd.DataFrame(rows).to_string(index=False))
 
 
