@@ -162,7 +162,7 @@ class Slow:
 
     def losses(self, batch):
         config, sums = self.agent.config, {}
-        self.untouched = []  # both advantages of each action that the limit does not touch
+        self.untouched = []  # both advantages of each action for which nothing is paid
 
         def add(name, value):
             sums[name] = sums.get(name, 0.0) + value / B
@@ -178,7 +178,8 @@ class Slow:
             if self.name != "IQL":
                 backup, q_cost, cost = self.cost_of(x, s, a, s_next)
                 state_cost = self.cost(self.call("online", "cost_value", s)[0])
-                if cost <= limit and state_cost <= limit:
+                keeps = cost <= limit and state_cost <= limit
+                if math.isinf(limit) if self.name in CONDITIONED else keeps:
                     self.untouched.append((q - self.call("online", "value", s)[0], cost - state_cost))
                 q = self.penalised(q, cost, s, limit)
                 add("safe_fraction", cost <= limit)
@@ -285,6 +286,20 @@ def test_the_reconstruction_is_trained_in_float32():
     states = (agent.reconstruction.state_dict() for agent in (first, second))
     for one, other in zip(*(state.values() for state in states), strict=True):
         assert torch.equal(one, other)
+
+
+def test_values_start_at_the_data_or_at_zero():
+    """One layer without its first bias: at the zero input a network's output is its last bias alone."""
+    data = toy_dataset()
+    for guess, cost in (("data", float(data.costs.mean()) / (1 - TASK.gammas[0])), ("zero", 0.0)):
+        agent = make_agent("CIQL", first_guess=guess, gamma=TASK.gammas[0], hidden_layers=0)
+        agent.prepare([data], progress=False)
+        net, zero = agent.networks(0), torch.zeros(1, 3)
+        action = torch.zeros(1, agent.task.act_dim)
+        assert net.cost_value(zero).item() == pytest.approx(cost, abs=1e-5)
+        assert net.target_cost_critics(zero, action).flatten().tolist() == pytest.approx([cost] * 2, abs=1e-5)
+        if guess == "zero":
+            assert net.value(zero).item() == pytest.approx(0, abs=1e-5)
 
 
 # --- Terminals and time limits ---

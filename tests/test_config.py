@@ -52,6 +52,45 @@ def test_changes_come_last_and_leave_all_else(kind, profile, task):
         assert config == kind.Config()
 
 
+def test_the_printed_profile_is_what_the_paper_prints_at_the_sizes_of_small():
+    printed, small, paper = (
+        C2IQL.configure(profile, TASKS["AntCircle"]) for profile in ("printed", "small", "paper")
+    )
+    sizes = {
+        "updates",
+        "batch_size",
+        "hidden_width",
+        "policy_lr",
+        "target_tau",
+        "crm_width",
+        "crm_layers",
+        "crm_steps",
+    }
+    for name in sizes:
+        assert getattr(printed, name) == getattr(small, name)
+    assert (printed.kappa_1, printed.kappa_2, printed.gamma, printed.critic_lr) == (
+        0.7,
+        0.9,
+        0.99,
+        1e-3,
+    )  # Table 4
+    silent = {
+        "time_limits": "bootstrap",
+        "reward_time_limits": "bootstrap",
+        "cost_critics": 1,
+        "first_guess": "zero",
+    }
+    silent |= {"thresholds_per": "batch", "infinite_at_test": "never", "normalise_observations": False}
+    differs = {
+        field.name
+        for field in dataclasses.fields(printed)
+        if getattr(printed, field.name) != getattr(paper, field.name)
+    }
+    assert differs == sizes | silent.keys() | {"profile"}
+    assert {name: getattr(printed, name) for name in silent} == silent
+    assert (printed.unsafe_price, printed.crm_noise, printed.zero_threshold) == (None, 0.1, False)
+
+
 def test_what_an_algorithm_does_not_read_is_refused():
     with pytest.raises(ValueError, match="option kappa_1.*: the options are profile, updates, batch_size"):
         BCAll.configure(kappa_1=0.5)
@@ -60,7 +99,7 @@ def test_what_an_algorithm_does_not_read_is_refused():
 
 
 def test_an_unknown_profile_is_refused_and_the_known_ones_are_listed():
-    with pytest.raises(ValueError, match="unknown profile 'huge': the profiles are paper, small"):
+    with pytest.raises(ValueError, match="unknown profile 'huge': the profiles are paper, small, printed"):
         C2IQL.configure("huge")
 
 

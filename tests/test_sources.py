@@ -281,6 +281,17 @@ def test_no_network(server, tmp_path):
         fetch(server, tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("bound", "most", "words"),
+    [("MAX_BYTES", 1_000, "more than 1,000 bytes"), ("MAX_SECONDS", -1, "not complete")],
+)
+def test_a_download_is_bounded_and_not_repeated(server, tmp_path, monkeypatch, bound, most, words):
+    monkeypatch.setattr(sources, bound, most)
+    with refused(f"^{server.url}{CAR_RUN.dsrl_file}: {words}"):
+        fetch(server, tmp_path)
+    assert server.requests == 1 and os.listdir(tmp_path) == []
+
+
 def test_a_full_disk(server, tmp_path, monkeypatch):
     def write(*args, **kwargs):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))

@@ -117,7 +117,7 @@ def _evaluate_job(agent: Agent, run: int, limit: float, episodes: range, held_ou
     return pd.DataFrame(
         {
             "task": agent.task.name,
-            "algorithm": agent.name,
+            "algorithm": agent.label,
             "profile": agent.config.profile,
             "seed": seed,
             "threshold": limit,

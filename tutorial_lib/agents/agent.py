@@ -176,6 +176,16 @@ class Agent(Runs):
     # What all algorithms share -----------------------------------------------------------------------------
 
     @classmethod
+    def row_name(cls, profile: str) -> str:
+        """Returns the algorithm's name in results. An algorithm as it is printed has a row of its own."""
+        return f"{cls.name} (printed)" if profile == "printed" else cls.name
+
+    @property
+    def label(self) -> str:
+        """The agent's name in results."""
+        return self.row_name(self.config.profile)
+
+    @classmethod
     def configure(cls, profile: str = "small", task: Task | None = None, **changes: Any) -> AnyConfig:
         """Returns the options of a profile, changed by those of the task, if one is given, and by `changes`.
 

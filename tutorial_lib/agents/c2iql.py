@@ -174,6 +174,13 @@ class C2IQL(ConstrainedAgent):
             q_cost = q_cost * (1 - gammas**horizon)
         return self.reconstruction(q_cost)
 
+    def untouched(self, cost: Tensor, state_cost: Tensor, limit: Tensor) -> Tensor:
+        """Returns true where the limit is infinite, (B,): no V_r there contains a payment, now or later.
+
+        So the exchange rate does not depend on the price, and cannot raise itself.
+        """
+        return limit.isinf() if self.conditioned else super().untouched(cost, state_cost, limit)
+
     def losses(self, net: Networks, batch: Fields) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
         config, a, limit = self.config, batch.actions, batch.limit
         s, s_next = self._inputs(net, batch)

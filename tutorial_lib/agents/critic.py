@@ -33,8 +33,11 @@ class CriticConfig(Config):
     """If true, the dataset's smallest reward is subtracted from all rewards, so that none is negative. The
     zero of eq. 11 is a penalty only where Q_r > 0."""
 
-    # With so few updates, the targets must be faster.
-    profiles = {"small": {"target_tau": 0.1}}
+    # With so few updates, the targets must be faster. IQL's code bootstraps through time limits.
+    profiles = {
+        "small": {"target_tau": 0.1},
+        "printed": {"target_tau": 0.1, "reward_time_limits": "bootstrap"},
+    }
 
 
 class CriticAgent(Agent):

@@ -59,14 +59,23 @@ class ConstrainedConfig(ImplicitConfig):
     price_unit: Literal["return", "advantage"] = "return"
     """The unit of `unsafe_price`. With 'return', it is `reward_scale` (discounted reward) per cost range.
     With 'advantage', it is the spread of the advantages of reward over the spread of those of cost, both over
-    the actions that the limit does not touch. A price in this unit says how much of what an action can earn
+    actions for which nothing is paid: those under an infinite limit where the algorithm has one, and those
+    that the limit does not touch elsewhere. A price in this unit says how much of what an action can earn
     may be given up for what it can cost, and does not change when rewards or costs are scaled or shifted."""
+    first_guess: Literal["data", "zero"] = "data"
+    """Where the value functions start. With 'data', those of cost start at the dataset's mean cost, and those
+    of reward at half of the best mean reward of the task. With 'zero', all start at zero. The paper does not
+    say, and with the penalty of eq. 11 it can decide what is learned: where all actions look too expensive at
+    first, no value tells them apart."""
     recorded_step: bool = False
     """If true, the cost of a recorded action is at least that of its recorded step, c + gamma V_c(s'). The
     critics are smooth, and the recorded step is exact where cost begins (at a speed or at a wall). Of two
     noisy estimates, the higher one also leaves a margin."""
 
-    profiles = {"small": {"kappa_2": 0.97, "unsafe_price": 6.0, "recorded_step": True}}
+    profiles = {
+        "small": {"kappa_2": 0.97, "unsafe_price": 6.0, "recorded_step": True},
+        "printed": {"time_limits": "bootstrap", "cost_critics": 1, "first_guess": "zero"},
+    }
 
     @property
     def evaluated_kappa(self) -> float:
@@ -104,7 +113,7 @@ class ConstrainedAgent(ImplicitAgent):
         "safe_fraction": "share of recorded actions whose expected cost keeps the limit",
         "value_mean": "mean of V_r, in discounted reward",
         "negative_q": "share of recorded actions with Q_r < 0, where a penalty of zero is a reward",
-        "reward_spread": "standard deviation of Q_r - V_r where no limit binds, in discounted reward",
+        "reward_spread": "standard deviation of Q_r - V_r where nothing is paid, in discounted reward",
         "cost_spread": "standard deviation of an action's cost minus its state's there, in unsafe steps",
     }
 
@@ -144,12 +153,15 @@ class ConstrainedAgent(ImplicitAgent):
         return measured
 
     def prepare(self, datasets: Sequence[Dataset], progress: bool = True) -> None:
-        """Measures each run's variables, and lets all cost heads start at the dataset's cost rate.
+        """Measures each run's variables, and lets all values start where `first_guess` says.
 
-        With a closer first guess the heads disagree less while they converge, and a reconstruction depends on
-        their differences.
+        With a closer first guess the cost heads disagree less while they converge, and a reconstruction
+        depends on their differences.
         """
         super().prepare(datasets, progress)
+        if self.config.first_guess == "zero":  # a network's output o gives the value scale (1 + o)
+            valued = ("value", "critics", "cost_value", "cost_critics")
+            return self.fill_last_bias(valued, [-1.0] * len(self.seeds))
         horizon, limit = self.task.horizon, self.task.typical_limit
         guesses = [float(dataset.costs.mean()) * horizon / limit - 1 for dataset in datasets]
         self.fill_last_bias(("cost_value", "cost_critics"), guesses)
@@ -208,17 +220,25 @@ class ConstrainedAgent(ImplicitAgent):
     def spreads(
         self, q_reward: Tensor, v: Tensor, cost: Tensor, value_cost: Tensor, limit: Tensor
     ) -> dict[str, Tensor]:
-        """Returns the standard deviations of both advantages over the actions that the limit does not touch.
+        """Returns the standard deviations of both advantages over the actions for which nothing is paid.
 
-        These are the actions whose cost and whose state's cost keep the limit. Q_r, V_r, costs and limits are
-        (B,), and the heads of V_c are (B, m). Where there are fewer than two such actions, both are zero.
+        Q_r, V_r, costs and limits are (B,), and the heads of V_c are (B, m). Where there are fewer than two
+        such actions, both are zero.
         """
         state_cost = self.episode_cost(value_cost)
-        untouched = (torch.maximum(cost, state_cost) <= limit).float()
+        untouched = self.untouched(cost, state_cost, limit).float()
         return {
             "reward_spread": losses.spread(q_reward - v, untouched).detach(),
             "cost_spread": losses.spread(cost - state_cost, untouched).detach(),
         }
+
+    def untouched(self, cost: Tensor, state_cost: Tensor, limit: Tensor) -> Tensor:
+        """Returns true where the limit does not touch an action: its cost and its state's cost keep it, (B,).
+
+        Under one finite limit V_r contains the payments of later steps, and they spread the advantages of
+        such actions, too. A high price under a tight limit can therefore raise itself.
+        """
+        return torch.maximum(cost, state_cost) <= limit
 
     def step(self, net: Networks, batch: Fields, scalars: dict[str, Tensor]) -> dict[str, Tensor]:
         """Returns the exchange rate, which follows the ratio of the two spreads slowly."""

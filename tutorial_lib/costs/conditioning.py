@@ -51,7 +51,10 @@ class ConditioningConfig(Config):
     it is when the code of infinity (1.5 cost ranges) is the closest to the rescaled budget. With 'never', the
     paper's "closest value" is always finite."""
 
-    profiles = {"small": {"zero_threshold": True}}
+    profiles = {
+        "small": {"zero_threshold": True},
+        "printed": {"thresholds_per": "batch", "infinite_at_test": "never"},
+    }
 
 
 INFINITE_CODE = 1.5

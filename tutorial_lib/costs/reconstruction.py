@@ -48,6 +48,7 @@ class ReconstructionConfig(Config):
 
     profiles = {
         "small": {"crm_width": 64, "crm_layers": 2, "crm_steps": 5_000, "crm_noise_rate": 0.01},
+        "printed": {"crm_width": 64, "crm_layers": 2, "crm_steps": 5_000},
     }
 
     def __post_init__(self):

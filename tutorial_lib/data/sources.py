@@ -5,6 +5,7 @@ import functools
 import hashlib
 import os
 import shutil
+import time
 from pathlib import Path
 
 from tutorial_lib.data.dataset import Dataset, DatasetError
@@ -14,6 +15,10 @@ from tutorial_lib.files import written_whole
 from tutorial_lib.tasks import TASKS, Task, as_task
 
 DSRL_URL = "https://huggingface.co/datasets/YYY-45/DSRL/resolve/main/"
+MAX_BYTES = 5_000_000_000
+"""A download may have this number of bytes. DSRL's largest files have less than one billion."""
+MAX_SECONDS = 4 * 3600
+"""A download may take this number of seconds."""
 SHIPPED_DATA = data_folder()
 """The folder of the datasets, agents and results that are shipped with the project."""
 CHECKSUMS = "checksums.txt"
@@ -120,7 +125,7 @@ def fetch_dataset(task: Task | str, directory: Path | str | None = None, base_ur
     task's dataset.
 
     Raises DatasetError where there is no network, no such file on the server, or no space, and for a file
-    that has another SHA-256 or cannot be read.
+    that is larger than `MAX_BYTES`, takes longer than `MAX_SECONDS`, has another SHA-256 or cannot be read.
     """
     task = as_task(task)
     path = Path(directory or dsrl_directory()).expanduser() / task.dsrl_file
@@ -166,6 +171,29 @@ def _remembered(memory: Path) -> str | None:
     return next(iter(memory.read_text().split()), None) if memory.exists() else None
 
 
+class _Unbounded(Exception):
+    """A download is too large or too slow. This is no ValueError, because pooch repeats after one."""
+
+
+class _Bounded:
+    """A file to write into, which takes at most `MAX_BYTES` within `MAX_SECONDS`."""
+
+    def __init__(self, path: str):
+        self.file, self.size, self.end = open(path, "wb"), 0, time.monotonic() + MAX_SECONDS
+
+    def write(self, part: bytes) -> None:
+        """Writes what has arrived. Raises _Unbounded where it is too much or too late."""
+        self.size += len(part)
+        if self.size > MAX_BYTES:
+            raise _Unbounded(f"more than {MAX_BYTES:,} bytes: is the address right?")
+        if time.monotonic() > self.end:
+            raise _Unbounded(f"not complete after {MAX_SECONDS:,} s: try again later")
+        self.file.write(part)
+
+    def flush(self) -> None:
+        """Does nothing, because closing the file flushes it."""
+
+
 def _download(base_url: str, name: str, folder: Path) -> Path:
     """Download one file into `folder`. A broken connection is tried again, up to three times in all.
 
@@ -177,8 +205,16 @@ def _download(base_url: str, name: str, folder: Path) -> Path:
     shutil.rmtree(folder, ignore_errors=True)
     server = pooch.create(folder, base_url, registry={name: None}, retry_if_failed=2)
     url = server.get_url(name)
+
+    def bounded(url: str, path: str, server: pooch.Pooch) -> None:
+        file = _Bounded(path)
+        with file.file:  # in small parts, so that a slow server meets the end
+            pooch.HTTPDownloader(progressbar=True, chunk_size=2**13)(url, file, server)
+
     try:
-        return Path(server.fetch(name, downloader=pooch.HTTPDownloader(progressbar=True, chunk_size=2**16)))
+        return Path(server.fetch(name, downloader=bounded))
+    except _Unbounded as error:
+        raise DatasetError(f"{url}: {error}") from error
     except requests.HTTPError as error:
         answer = error.response
         status = "no" if answer is None else f"{answer.status_code} {answer.reason}"

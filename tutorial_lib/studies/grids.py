@@ -36,6 +36,8 @@ class Grid:
     """Changes of options that only playing reads. Every agent plays its episodes once with each."""
     seeds: int = 3
     """The number of seeds."""
+    profile: str | None = None
+    """The profile of these entries. None: the one that `entries` is asked for."""
     limits: tuple[float, ...] | None = None
     """The limits that agents play under. None: the task's thresholds."""
 
@@ -63,6 +65,7 @@ STUDIES: dict[str, Study] = {
         "The paper's Table 1: how much reward at how much cost, on every task whose data is shipped?",
         (
             Grid(tuple(TASKS), ("C2IQL",), seeds=5),
+            Grid(tuple(TASKS), ("C2IQL",), seeds=5, profile="printed"),
             Grid(tuple(TASKS), tuple(name for name in TABLE1_ALGORITHMS if name != "C2IQL")),
         ),
     ),
@@ -173,7 +176,7 @@ def entries(
             runs = Runs(
                 task=task,
                 algorithm=algorithm,
-                config=change(kind.configure(profile, record, **options)),
+                config=change(kind.configure(grid.profile or profile, record, **options)),
                 seeds=tuple(range(grid.seeds)),
                 trained_for=record.thresholds if kind.needs_limit else None,
                 limits=grid.limits,

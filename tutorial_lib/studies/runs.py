@@ -59,12 +59,15 @@ class Runs:
     @property
     def name(self) -> str:
         """The entry's name: its task, algorithm and label, and a hash of its options, seeds and data."""
-        words = "-".join(
-            part.replace(" ", "-") for part in (self.task, slug(self.algorithm), self.label) if part
-        )
+        words = "-".join(part.replace(" ", "-") for part in (self.task, slug(self.row), self.label) if part)
         everything = dataclasses.asdict(self)
         del everything["data"]  # a path: the checksum stands for the data themselves
         return f"{words}-{hashlib.sha256(json.dumps(everything).encode()).hexdigest()[:8]}"
+
+    @property
+    def row(self) -> str:
+        """The name of these runs in the results."""
+        return get_algorithm(self.algorithm).row_name(self.config.profile)
 
     @property
     def pairs(self) -> list[tuple[int, float | None]]:
@@ -184,7 +187,7 @@ def collect(chosen: Sequence[Runs], folder: Path, path: Path, keep: bool = False
             )
         again = pd.MultiIndex.from_frame(before[key]).isin(pd.MultiIndex.from_frame(results[key]))
         results = pd.concat([before[~again], results], ignore_index=True)
-        place = {(runs.task, runs.algorithm): i for i, runs in reversed(list(enumerate(chosen)))}
+        place = {(runs.task, runs.row): i for i, runs in reversed(list(enumerate(chosen)))}
         of_rows = zip(results["task"], results["algorithm"], strict=True)
         rows = [place.get(pair, len(chosen)) for pair in of_rows]  # tasks outside the grid come last
         results = results.iloc[np.argsort(rows, kind="stable")]
