@@ -17,5 +17,6 @@ from tutorial_lib.course.checks.iql import *
 from tutorial_lib.course.checks.penalty import *
 from tutorial_lib.course.checks.reconstruction import *
 from tutorial_lib.course.checks.recordings import *
+from tutorial_lib.course.checks.safety import *
 from tutorial_lib.course.checks.start import *
 from tutorial_lib.course.checks.studies import *

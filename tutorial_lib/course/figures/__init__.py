@@ -15,6 +15,7 @@ from tutorial_lib.course.figures.penalty import *
 from tutorial_lib.course.figures.reconstruction import *
 from tutorial_lib.course.figures.recordings import *
 from tutorial_lib.course.figures.results import *
+from tutorial_lib.course.figures.safety import *
 from tutorial_lib.course.figures.shortcut import *
 from tutorial_lib.studies.figures import *
 from tutorial_lib.style import *
