@@ -4,6 +4,7 @@ Run as a script, this file is the process that gets killed.
 """
 
 import functools
+import hashlib
 import json
 import math
 import os
@@ -25,8 +26,8 @@ from tutorial_lib.data import collect as collecting
 from tutorial_lib.data import ppo
 from tutorial_lib.data.behaviour import KINDS, LagrangianCost, PricedCost, RecordedTask, along_own_axes
 from tutorial_lib.data.collect import SOURCES, read_source
-from tutorial_lib.data.dataset import KEYS
-from tutorial_lib.data.hdf5 import read_dataset
+from tutorial_lib.data.dataset import KEYS, DatasetError
+from tutorial_lib.data.hdf5 import read_dataset, write_dataset
 from tutorial_lib.data.ppo import load_ppo, make_ppo, run_ppo, save_ppo
 from tutorial_lib.data.schedule import Schedule
 from tutorial_lib.tasks import TASKS, all_tasks
@@ -508,6 +509,34 @@ def test_the_episodes_of_a_source_stand_together_in_the_order_of_sources(sources
     assert [(kind, seed, run) for _, _, kind, seed, run in asked] == [
         (*source.split("-")[:1], int(source.split("-")[1]), runs / source) for source in sources
     ]
+
+
+def test_a_source_is_added_to_a_dataset_whose_runs_are_gone(tmp_path, monkeypatch):
+    """What is left of the first runs is in their file; the second collection reads that and one more run."""
+    runs, first, both = tmp_path / "AntRun", tmp_path / "first.hdf5", tmp_path / "both.hdf5"
+    write_run(runs / "priced-0", [[(0, True), (5, False), (190, False)], [(7, False)]], 100)
+    write_run(runs / "lagrangian-7", [[(2, False), (199, False)]], 200)
+    write_run(runs / "priced-2", [[(4, False)], [(1, True)]], 300)
+    monkeypatch.setattr(collecting, "run_ppo", lambda *arguments: None)
+    collecting.collect(ANT, ("priced-0", "lagrangian-7"), RECIPE, tmp_path, first, workers=1)
+    for name in ("priced-0", "lagrangian-7"):
+        for file in (runs / name).iterdir():
+            file.unlink()
+    made = collecting.collect(ANT, (str(first), "priced-2"), RECIPE, tmp_path, both, workers=1)
+    assert made.observations[made.starts, 0].tolist() == [100, 101, 103, 200, 300, 301]
+    attributes = made.attributes
+    assert json.loads(attributes["episodes_by_source"]) == {"priced-0": 3, "lagrangian-7": 1, "priced-2": 2}
+    assert (attributes["collected_episodes"], attributes["collected_steps"]) == (8, 3 * RECIPE.steps)
+    digest = hashlib.sha256(first.read_bytes()).hexdigest()
+    assert attributes["made_from"] == f"first.hdf5 (SHA-256 {digest}), priced-2"
+    before = both.read_bytes()
+    collecting.collect(ANT, (str(first), "priced-2"), RECIPE, tmp_path, both, workers=1)
+    assert both.read_bytes() == before
+    with pytest.raises(ValueError, match="each of them once"):
+        collecting.collect(ANT, (str(both), "priced-2"), RECIPE, tmp_path, first, workers=1)
+    silent = write_dataset(tmp_path / "silent.hdf5", replace(made, attributes={}), ANT)
+    with pytest.raises(DatasetError, match=f"^{silent}: does not say which episodes are from which source"):
+        collecting.collect(ANT, (str(silent), "priced-2"), RECIPE, tmp_path, first, workers=1)
 
 
 @pytest.mark.parametrize(

@@ -67,7 +67,8 @@ def collect(
     Args:
         task: This is the name of the task, e.g. BallCircle.
         out: The dataset is written to this file. The default is runs/collect/TASK.hdf5.
-        sources: These are one PPO run each, with a kind, which is priced or lagrangian, and a seed.
+        sources: These are one PPO run each, with a kind, which is priced or lagrangian, and a seed. A source
+            can also be the file of a dataset that was collected before, to which the others are added.
         steps: Each run makes this number of simulator steps. The default is in the task's recipe.
         episodes: The dataset keeps about this number of episodes. The default is in the task's recipe.
         runs: This folder holds the saved state of the collection.

@@ -13,11 +13,12 @@ This module imports `tutorial_lib.data.ppo` and with it stable-baselines3, which
 where it is needed.
 """
 
+import hashlib
 import json
 from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import joblib
 import numpy as np
@@ -25,7 +26,7 @@ import pandas as pd
 from safetensors.numpy import load_file
 
 from tutorial_lib.data.behaviour import KINDS
-from tutorial_lib.data.dataset import KEYS, Dataset
+from tutorial_lib.data.dataset import KEYS, Dataset, DatasetError
 from tutorial_lib.data.hdf5 import read_dataset, write_dataset
 from tutorial_lib.data.ppo import episode_files, run_ppo
 from tutorial_lib.data.thinning import thin
@@ -60,28 +61,34 @@ def collect(
     Up to `workers` runs are carried out at the same time. The run of a source is kept in the folder
     `folder / task.name / source`, and continues there after a kill.
 
+    A source can also be the file of a dataset that was collected before, so that its runs need not be there
+    any more. Its episodes then stand in the place of those runs.
+
     The dataset has the sources in the order of `sources`, and the episodes of a source in the order in which
     they ended. Equal collections write equal files, also where a run was killed and resumed. The file's
     attribute `episodes_by_source` is a JSON object with the number of episodes of each source. Returns the
     dataset as it is read back from `out`.
 
     Raises ValueError where `sources` is empty, repeats a source or has one of another form than `read_source`
-    takes, where a run was begun with another recipe, and where `thin` raises it.
+    takes, where a run was begun with another recipe, and where `thin` raises it. Raises DatasetError for a
+    file that is none of the task, or that `collect` did not write.
     """
     check_output(out)
-    if not sources or len(set(sources)) < len(sources):
+    before = {source: _collected(Path(source), task) for source in sources if source.endswith(".hdf5")}
+    runs = {source: folder / task.name / source for source in sources if source not in before}
+    names = [name for source in sources for name in (before[source].parts if source in before else [source])]
+    if not sources or len(set(names)) < len(names):
         raise ValueError(f"sources {list(sources)}: give at least one, and each of them once")
-    kinds_and_seeds = [read_source(source) for source in sources]
-    runs = [folder / task.name / source for source in sources]
+    kinds_and_seeds = [read_source(source) for source in runs]
     joblib.Parallel(n_jobs=workers)(
         joblib.delayed(run_ppo)(task, recipe, kind, seed, run)
-        for (kind, seed), run in zip(kinds_and_seeds, runs, strict=True)
+        for (kind, seed), run in zip(kinds_and_seeds, runs.values(), strict=True)
     )
     episodes = pd.concat(
         [
-            _table(file).assign(source=source)
-            for source, run in zip(sources, runs, strict=True)
-            for file in episode_files(run)
+            _table(file, task).assign(source=before[source].of_episodes if source in before else source)
+            for source in sources
+            for file in ([Path(source)] if source in before else episode_files(runs[source]))
         ],
         ignore_index=True,
     )
@@ -89,14 +96,34 @@ def collect(
     bounds = task.thresholds, task.cost_range, task.max_return
     kept = thin(costs, returns, of_source, recipe.episodes, *bounds, return_bins=recipe.return_bins)
     chosen = episodes.iloc[kept]
-    dataset = _read(chosen)
-    counts = {source: int((chosen["source"] == source).sum()) for source in sources}
-    attributes = _origin(task, recipe) | {
-        "episodes_by_source": json.dumps(counts),
-        "collected_episodes": len(episodes),
-        "collected_steps": len(sources) * recipe.steps,
+    attributes = _origin(task, recipe) | _counts(names, chosen, len(episodes), recipe, runs, before)
+    written = write_dataset(out, _read(chosen, task), task, attributes, MANTISSA_BITS)
+    return read_dataset(written, task)
+
+
+def _counts(
+    names: list[str],
+    chosen: pd.DataFrame,
+    seen: int,
+    recipe: Recipe,
+    runs: dict[str, Path],
+    before: dict[str, "_Collected"],
+) -> dict[str, Any]:
+    """Returns what a dataset's file says of its sources.
+
+    `names` are all sources, in order. `seen` episodes were read, and those of `chosen` are kept. `runs` and
+    `before` are the sources that are runs and those that are files.
+    """
+    left_out = sum(made.episodes - len(made.of_episodes) for made in before.values())
+    counts: dict[str, Any] = {
+        "episodes_by_source": json.dumps({name: int((chosen["source"] == name).sum()) for name in names}),
+        "collected_episodes": seen + left_out,
+        "collected_steps": len(runs) * recipe.steps + sum(made.steps for made in before.values()),
     }
-    return read_dataset(write_dataset(out, dataset, task, attributes, MANTISSA_BITS), task)
+    if before:
+        of_files = [f"{Path(source).name} (SHA-256 {made.digest})" for source, made in before.items()]
+        counts["made_from"] = ", ".join([*of_files, *runs])
+    return counts
 
 
 def _origin(task: Task, recipe: Recipe) -> dict[str, str]:
@@ -112,29 +139,61 @@ def _origin(task: Task, recipe: Recipe) -> dict[str, str]:
     }
 
 
+class _Collected(NamedTuple):
+    """What a dataset that was collected before says of its origin."""
+
+    parts: dict[str, int]
+    """The number of episodes of each source."""
+    of_episodes: list[str]
+    """The source of each episode."""
+    episodes: int
+    """How many episodes its runs had."""
+    steps: int
+    """How many steps its runs had."""
+    digest: str
+    """The SHA-256 of the file."""
+
+
+def _collected(path: Path, task: Task) -> _Collected:
+    """Returns what the file of a dataset says of its origin. Raises DatasetError where it does not say it."""
+    dataset = read_dataset(path, task)
+    try:
+        parts = json.loads(str(dataset.attributes["episodes_by_source"]))
+        of_episodes = [source for source, count in parts.items() for _ in range(count)]
+        if len(of_episodes) != dataset.num_episodes:
+            raise ValueError("its sources have another number of episodes than the file")
+        counts = int(dataset.attributes["collected_episodes"]), int(dataset.attributes["collected_steps"])
+    except (KeyError, AttributeError, TypeError, ValueError) as error:
+        reason = f"does not say which episodes are from which source ({error})"
+        raise DatasetError(f"{path}: {reason}: name a file that `c2iql collect` wrote") from error
+    return _Collected(parts, of_episodes, *counts, hashlib.sha256(path.read_bytes()).hexdigest())
+
+
 # A run of AntCircle is 3 GB. The files are therefore read one at a time, and twice: first for the table of
 # their episodes, and then for the few episodes that are kept.
 
 
-def _load(file: Path) -> Dataset:
-    """The episodes of a file."""
+def _load(file: Path, task: Task) -> Dataset:
+    """The episodes of a file of a run, or of a dataset."""
+    if file.suffix == ".hdf5":
+        return read_dataset(file, task)
     arrays: dict[str, Any] = load_file(file)
     return Dataset(**arrays)
 
 
-def _table(file: Path) -> pd.DataFrame:
+def _table(file: Path, task: Task) -> pd.DataFrame:
     """One row for each episode of a file: the file, the episode's place in it, its cost and its return."""
-    data = _load(file)
+    data = _load(file, task)
     place = np.arange(data.num_episodes)
     return pd.DataFrame(
         {"file": str(file), "place": place, "cost": data.episode_costs, "return": data.episode_returns}
     )
 
 
-def _read(chosen: pd.DataFrame) -> Dataset:
+def _read(chosen: pd.DataFrame, task: Task) -> Dataset:
     """The episodes of these rows of the tables, which stand in the order of the tables."""
     parts = [
-        _load(Path(str(file))).select(rows["place"].to_numpy())
+        _load(Path(str(file)), task).select(rows["place"].to_numpy())
         for file, rows in chosen.groupby("file", sort=False)
     ]
     arrays: dict[str, Any] = {key: np.concatenate([getattr(part, key) for part in parts]) for key in KEYS}
