@@ -443,6 +443,31 @@ def test_evaluators_need_a_clock_and_the_rule_needs_evaluators():
         make_agent("C2IQL", tell="predicted")
 
 
+def test_controls_tell_one_limit_throughout_or_switch_between_two():
+    observations, cost = np.zeros((5, TASK.obs_dim), np.float32), np.array([2.0, 0.0, 0.0, 5.0, 0.0])
+    small, middle, high = TASK.thresholds  # 1, 3 and 6
+    limits = np.array([2.5, 0.0, 1e9, 5.0, math.inf])
+    for options, throughout in (
+        ({"thresholds": "range"}, [2.5, 0.0, TASK.cost_range, 5.0, math.inf]),
+        ({"zero_threshold": False}, [middle, small, high, high, math.inf]),
+    ):
+        zero = throughout[1]
+        agent = make_agent("C2IQL", **options)
+        for tell, first, second in (
+            ("throughout", throughout, throughout),
+            (
+                "switch",
+                [math.inf, zero, math.inf, math.inf, math.inf],
+                [math.inf, zero, math.inf, zero, math.inf],
+            ),
+        ):
+            player = agent.playing_with(tell=tell).player(limits, range(5))
+            player.act(observations)
+            assert player.told.tolist() == first
+            player.see(np.zeros(5), cost)
+            assert player.told.tolist() == second
+
+
 def told_by_hand(agent, observation, left, t):
     """The largest limit whose predicted rest of the episode fits what is left, tried one by one."""
     slow, fitting = Slow(agent), [0.0]

@@ -66,6 +66,7 @@ def words(text):
         "fetch": ["Download DSRL's dataset", "DSRL_DATASET_DIR"],
         "data": ["Check, convert and export files of datasets"],
         "train": ["Train", "--limits", "--kappa-2", "{cpu,cuda}"],
+        "capstone": ["Score an agent of your own", "for each limit or seed"],
         "evaluate": ["Run a trained agent in the simulator", "--limits", "per run and limit"],
         "report": ["Make tables and figures from the results' files", "whose table is printed"],
         "study": ["Run a study", "address of a dask scheduler", "--only", "updates=200"],

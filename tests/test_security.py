@@ -175,6 +175,7 @@ COMMANDS = [
     f"train IQL BallRun --data data.hdf5 --out run --updates 2 {SIZES}",
     "evaluate run/agent.safetensors --limits 40 --episodes 11 --workers 2",
     "certify run/agent.safetensors --limits 40 --episodes 2 --workers 1",
+    "capstone run/agent.safetensors --workers 1 --out capstone.json",
     "study small --data data.hdf5 --workers 1 --runs runs "
     "--option updates=2 batch_size=8 hidden_width=8 hidden_layers=1",
 ]

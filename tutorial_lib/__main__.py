@@ -1,4 +1,4 @@
-"""The command line: `c2iql tasks | collect | fetch | data | train | evaluate | certify | study | report`.
+"""The command line: `c2iql tasks | collect | fetch | data | train | evaluate | certify | capstone | ...`.
 
 tyro makes commands with types and help from functions and dataclasses, so each option is written only once.
 """
@@ -8,11 +8,13 @@ from importlib.metadata import version
 
 import tyro
 
-from tutorial_lib.commands.agents import certify, evaluate, train
+from tutorial_lib.commands.agents import capstone, certify, evaluate, train
 from tutorial_lib.commands.data import collect, data, fetch, tasks
 from tutorial_lib.commands.studies import report, study
 
-COMMANDS = {f.__name__: f for f in (tasks, collect, fetch, data, train, evaluate, certify, study, report)}
+COMMANDS = {
+    f.__name__: f for f in (tasks, collect, fetch, data, train, evaluate, certify, capstone, study, report)
+}
 
 
 def main() -> None:

@@ -33,9 +33,12 @@ class EvaluationConfig(ConditioningConfig):
     evaluators: Annotated[int, NOT_NEGATIVE] = 0
     """The number of critics that learn what the policy that acts will pay. The highest counts. With 0 there
     are none. They need `clock=True`."""
-    tell: Literal["left", "predicted"] = "left"
+    tell: Literal["left", "predicted", "throughout", "switch"] = "left"
     """Which limit the policy is told at each step. With 'left', it is what is left of the limit (eq. 23).
-    With 'predicted', it is the largest limit for which the evaluators predict no more cost than is left."""
+    With 'predicted', it is the largest limit for which the evaluators predict no more cost than is left. The
+    other two are controls. With 'throughout', it is the limit itself at every step, so that nothing counts
+    the cost. With 'switch', it is infinity as long as anything is left, and then zero, so that the network
+    knows of no limit between the two."""
 
     def __post_init__(self):
         super().__post_init__()

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tutorial_lib.costs.conditioning import told_limit
+from tutorial_lib.costs.conditioning import told_limit, trained_limit
 
 if TYPE_CHECKING:
     from tutorial_lib.agents.agent import Agent
@@ -81,11 +81,10 @@ class BudgetPlayer(CountingPlayer):
 
     def _choose(self, observations: np.ndarray) -> np.ndarray:
         """Returns the limits that the policy is told at observations (E, obs), (E,)."""
-        if self.agent.config.tell == "left":
-            return self.left
-        left = self.limits - self.spent
-        self._chosen = self.agent.largest_limit(observations, left, self.run, self.t)
-        return self._chosen
+        if self.agent.config.tell == "predicted":
+            left = self.limits - self.spent
+            self._predicted = self.agent.largest_limit(observations, left, self.run, self.t)
+        return self.told
 
     def act(self, observations: np.ndarray) -> np.ndarray:
         return self.agent.act(observations, self._choose(observations), self.run, self.t)
@@ -93,7 +92,14 @@ class BudgetPlayer(CountingPlayer):
     @property
     def told(self) -> np.ndarray:
         """The limit that the policy is told at this step, (E,). With tell='predicted', `act` chooses it."""
-        return self._chosen if self.agent.config.tell == "predicted" else self.left
+        task, config = self.agent.task, self.agent.config
+        if config.tell == "predicted":
+            return self._predicted
+        if config.tell == "throughout":
+            return trained_limit(task, config, self.limits)
+        if config.tell == "switch":
+            return trained_limit(task, config, np.where(self.spent < self.limits, np.inf, 0.0))
+        return self.left
 
     def predicted_cost(self, observations: np.ndarray) -> np.ndarray:
         return self.agent.predicted_cost(observations, self._choose(observations), self.run, self.t)

@@ -1,4 +1,4 @@
-"""The commands that train and play agents: `c2iql train | evaluate | certify`."""
+"""The commands that train and play agents: `c2iql train | evaluate | certify | capstone`."""
 
 from pathlib import Path
 
@@ -112,3 +112,38 @@ def certify(
     if out:
         scores.save_results(table, out)
         print(f"wrote {out}")
+
+
+def capstone(agent: tyro.conf.Positional[Path], out: Path | None = None, workers: int = 2) -> None:
+    """Score an agent of your own: frozen starts, each limit of its task, and a bar to beat.
+
+    The bar is the normalised reward that the shipped C2IQL and two kinds of cloning have at the cost that
+    your agent pays. It is read from the results of study table1. The command prints a table and a verdict.
+
+    Args:
+        agent: This is the path of an agent.safetensors, or of a folder with one for each limit or seed.
+        out: The scores are written to this JSON, for a teacher. The default is beside the agent, e.g.
+            agent-capstone.json.
+        workers: This is the number of processes. The results do not depend on it.
+    """
+    from tutorial_lib.files import check_output
+    from tutorial_lib.studies import capstone as scoring
+
+    check_counts(workers=workers)
+    out = out or (
+        agent / "capstone.json" if agent.is_dir() else agent.with_name(f"{agent.stem}-capstone.json")
+    )
+    check_output(out)
+    agents = scoring.load(agent)
+    reference = scoring.references(agents[0].task.name)
+    table = scoring.score(scoring.play(agents, workers), reference)
+    lines = scoring.verdict(table)
+    print(table.round(3).to_string(index=False))
+    print("(reward, cost: normalised. low, high: 95% bootstrap intervals over episodes, all seeds pooled)")
+    print("\n".join(lines))
+    if missing := [name for name in scoring.REFERENCES if name not in set(reference["algorithm"])]:
+        print(f"Not in the bar, because study table1 has no results of it: {', '.join(missing)}.")
+    if scoring.trained_on_shipped_data(agents) is False:
+        print("It was not trained on the shipped recordings of its task: by the rules it does not count.")
+    scoring.save_report(agents, table, lines, out)
+    print(f"wrote {out}")

@@ -159,12 +159,26 @@ def told_limit(
     predict the remaining cost and not that of a whole episode, so the budget is not rescaled.
     """
     budget = limits - spent if remaining else rescaled_budget(limits, spent, t, task.horizon)
-    if config.thresholds == "set":
-        with_infinite = config.infinite_at_test == "nearest"
-        chosen = nearest_threshold(budget, task, with_infinite, with_zero=config.zero_threshold)
-    else:  # every threshold was trained on, so the budget itself is told
-        chosen = np.clip(budget, 0.0, task.cost_range)
+    if config.thresholds == "set" and config.infinite_at_test == "nearest":
+        chosen = nearest_threshold(budget, task, with_infinite=True, with_zero=config.zero_threshold)
+    else:
+        chosen = _finite_limit(task, config, budget)
     if config.infinite_at_test == "covered":
         covered = limits - spent >= (task.horizon - t) * task.max_step_cost
         chosen = np.where(covered, np.inf, chosen)
     return chosen
+
+
+def trained_limit(task: Task, config: ConditioningConfig, limits: np.ndarray) -> np.ndarray:
+    """Returns the limits that the networks were trained with and that are closest to `limits` (E,), (E,).
+
+    An infinite limit stays infinite.
+    """
+    return np.where(np.isinf(limits), np.inf, _finite_limit(task, config, limits))
+
+
+def _finite_limit(task: Task, config: ConditioningConfig, limits: np.ndarray) -> np.ndarray:
+    """Returns the closest finite limit that is trained with, (E,), to each of `limits` (E,)."""
+    if config.thresholds == "set":
+        return nearest_threshold(limits, task, with_zero=config.zero_threshold)
+    return np.clip(limits, 0.0, task.cost_range)  # every limit between was trained with

@@ -13,6 +13,7 @@ from tutorial_lib.course.checks.checker import *
 from tutorial_lib.course.checks.cmdp import *
 from tutorial_lib.course.checks.conditioning import *
 from tutorial_lib.course.checks.discounting import *
+from tutorial_lib.course.checks.failures import *
 from tutorial_lib.course.checks.iql import *
 from tutorial_lib.course.checks.penalty import *
 from tutorial_lib.course.checks.reconstruction import *
