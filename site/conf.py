@@ -19,6 +19,7 @@ import tutorial_lib
 
 sys.path.insert(0, str(Path(__file__).parent))
 import algorithms  # noqa: E402
+import landing  # noqa: E402
 from marks import remove_marks  # noqa: E402
 from moving import replace_widgets  # noqa: E402
 
@@ -89,7 +90,7 @@ def finish_page(app: Sphinx, docname: str, source: list[str]) -> None:
     """Change the text of a page, `source[0]`, before Sphinx reads it.
 
     Notebooks lose the comments for machines. Their sliders become pictures that move. What their images show
-    is kept for `describe_images`. The first page gets its table of contents.
+    is kept for `describe_images`. The first page gets its moving picture, its results and its contents.
     """
     if docname.startswith("notebooks/"):
         notebook = json.loads(source[0])
@@ -104,6 +105,9 @@ def finish_page(app: Sphinx, docname: str, source: list[str]) -> None:
                     DESCRIPTIONS[stem] = output["metadata"].get("image/png", {}).get("alt", "A figure.")
         source[0] = json.dumps(notebook)
     if docname == "index":
+        pictures = Path(app.srcdir, "pictures", "landing")
+        source[0] = source[0].replace("TEASER", landing.teaser(pictures, "pictures/landing"))
+        source[0] = source[0].replace("RESULTS", landing.results())
         source[0] = source[0].replace("CONTENTS", contents(Path(app.srcdir)))
 
 

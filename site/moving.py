@@ -29,8 +29,11 @@ def replace_widgets(notebook: Any, pictures: Path, address: str) -> None:
             data["text/html"] = control_html(json.loads(path.read_text("utf-8")), f"{address}/{number}")
 
 
-def control_html(control: dict, address: str) -> str:
-    """The HTML of one control: a range input for each slider, and the first picture."""
+def control_html(control: dict, address: str, before: str = "", after: str = "") -> str:
+    """The HTML of one control: a range input for each slider, and the first picture.
+
+    `before` and `after` are more HTML, before and after the picture.
+    """
     inputs, place = [], 0
     for slider in control["sliders"]:
         labels, start = slider["labels"], slider["start"]
@@ -44,7 +47,7 @@ def control_html(control: dict, address: str) -> str:
     picture, text = control["pictures"][place], html.escape(control["texts"][place])
     data = json.dumps(control).replace("<", "\\u003c")
     return (
-        f'<div class="moving" data-address="{address}">{"".join(inputs)}'
-        f'<img src="{address}/{picture}" alt="{text}">'
+        f'<div class="moving" data-address="{address}">{"".join(inputs)}{before}'
+        f'<img src="{address}/{picture}" alt="{text}">{after}'
         f'<script type="application/json">{data}</script></div>'
     )

@@ -1,8 +1,9 @@
-"""`python site/slides.py FROM TO` makes lecture slides from the notebooks in folder FROM, in folder TO.
+"""`python site/slides.py FROM TO` makes slides from the executed notebooks in folder FROM, in folder TO.
 
-nbconvert makes one HTML page of each notebook. In the browser, `lecture/pages.js` divides it into pages that
-fit the screen. reveal.js and MathJax are copied from installed packages to the slides, so that no network is
-needed.
+There are two kinds. The lectures are written in `decks/`, and take figures and numbers from the notebooks
+(see lectures.py). For live use, nbconvert makes one HTML page of each notebook, and in the browser,
+`lecture/pages.js` divides it into pages that fit the screen. reveal.js and MathJax are copied from installed
+packages to the slides, so that no network is needed.
 """
 
 import html
@@ -11,6 +12,7 @@ import sys
 from importlib.util import find_spec
 from pathlib import Path
 
+import lectures
 import nbformat
 from marks import remove_marks
 from moving import replace_widgets
@@ -18,10 +20,12 @@ from nbconvert import SlidesExporter
 from nbconvert.preprocessors import CoalesceStreamsPreprocessor
 
 HERE = Path(__file__).parent / "lecture"
+DECKS = Path(__file__).parent / "decks"
 SCRIPTS = {  # by package: the path of a file in the package's folder, and its path among the slides
     "sphinx_revealjs": {
         "_static/revealjs/dist/reveal.js": "dist/reveal.js",
         "_static/revealjs/dist/reveal.css": "dist/reveal.css",
+        "_static/revealjs/plugin/notes/notes.js": "dist/notes.js",
         "_static/revealjs/LICENSE": "dist/LICENSE",
     },
     "sphinx-mathjax-offline": {"static/mathjax/tex-svg-full.js": "mathjax.js"},
@@ -54,10 +58,16 @@ def title_of(notebook: nbformat.NotebookNode) -> str:
     return notebook.cells[0].source.splitlines()[0].removeprefix("# ")
 
 
-def index(titles: dict[str, str]) -> str:
-    """The HTML page with links to all slides. `titles` has the title of each file by its name."""
-    entries = [f'<li><a href="{name}">{html.escape(title)}</a></li>' for name, title in titles.items()]
-    return (HERE / "contents.html").read_text().replace("ENTRIES", "\n".join(entries))
+def index(titles: dict[str, str], talks: dict[str, str]) -> str:
+    """The HTML page with links to all slides. Both arguments have the title of each file by its name."""
+    entry = '<li><a{kind} href="{name}">{title}</a></li>'
+    live = [entry.format(kind="", name=name, title=html.escape(title)) for name, title in titles.items()]
+    decks = [
+        entry.format(kind=' class="deck"', name=name, title=html.escape(title))
+        for name, title in talks.items()
+    ]
+    text = (HERE / "contents.html").read_text(encoding="utf-8")
+    return text.replace("ENTRIES", "\n".join(live)).replace("LECTURES", "\n".join(decks))
 
 
 def copy_scripts(target: Path) -> None:
@@ -67,13 +77,17 @@ def copy_scripts(target: Path) -> None:
         folder = Path(find_spec(package).origin).parent
         for source, name in files.items():
             shutil.copyfile(folder / source, target / name)
-    shutil.copyfile(HERE / "pages.js", target / "pages.js")
+    for name in ("pages.js", "deck.js"):
+        shutil.copyfile(HERE / name, target / name)
     shutil.copyfile(HERE.parent / "moving.js", target / "moving.js")
     shutil.copyfile(HERE / "course.css", target / "dist" / "theme" / "course.css")
 
 
-def main(source: Path, target: Path) -> None:
-    """Write the slides of all notebooks in `source`, their scripts, and a page of contents to `target`."""
+def main(source: Path, target: Path, decks: Path | None = None) -> None:
+    """Write the slides of all notebooks in `source`, their scripts, and a page of contents to `target`.
+
+    `decks` is the folder with the texts of lectures. They need all notebooks that they take figures from.
+    """
     copy_scripts(target / "scripts")
     if (source.parent / "pictures").is_dir():
         shutil.copytree(source.parent / "pictures", target / "pictures", dirs_exist_ok=True)
@@ -82,8 +96,9 @@ def main(source: Path, target: Path) -> None:
         name = path.with_suffix(".html").name
         (target / name).write_text(convert(path), encoding="utf-8")
         titles[name] = title_of(nbformat.read(path, as_version=4))
-    (target / "index.html").write_text(index(titles), encoding="utf-8")
+    talks = lectures.write(decks, source, target, HERE / "deck.html") if decks else {}
+    (target / "index.html").write_text(index(titles, talks), encoding="utf-8")
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), Path(sys.argv[2]))
+    main(Path(sys.argv[1]), Path(sys.argv[2]), DECKS)

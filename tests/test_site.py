@@ -8,6 +8,7 @@ from pathlib import Path
 from urllib.parse import unquote
 
 import nbformat
+import pandas as pd
 import pytest
 from sample_notebook import sample, store_sample_pictures
 
@@ -172,3 +173,102 @@ def test_no_image_of_a_page_is_without_a_text(site, path):
     texts = re.findall(r'<img\b[^>]*?\balt="([^"]*)"', page)
     assert len(texts) == page.count("<img") and all(texts)
     assert not [text for text in texts if text.endswith(".png")]
+
+
+@pytest.fixture
+def first_page(site, browser):
+    """The site's first page for a visitor who has asked for less motion: nothing moves by itself."""
+    context = browser.new_context(viewport={"width": 1280, "height": 900}, reduced_motion="reduce")
+    page = context.new_page()
+    page.goto((site / "index.html").as_uri())
+    yield page
+    context.close()
+
+
+@pytest.mark.parametrize("width", [1280, 390])
+def test_a_visitor_names_a_limit_and_watches_the_robot_by_keyboard_alone(first_page, width):
+    page = first_page
+    page.set_viewport_size({"width": width, "height": 900})
+    limit, step = page.locator(".moving input").all()
+    picture, words, button = (page.locator(f".moving {part}") for part in ("img", ".words", "button"))
+    shown = []
+    for _ in range(3):
+        step.focus()
+        page.keyboard.press("End")
+        assert picture.get_attribute("alt") == words.inner_text()
+        assert picture.evaluate("image => image.decode().then(() => image.naturalWidth)") > 300
+        shown.append([int(number) for number in re.findall(r"\d+", words.inner_text())])
+        limit.focus()
+        page.keyboard.press("ArrowRight")
+    assert [named for named, _, _ in shown] == [10, 30, 70]
+    assert all(paid <= named for named, _, paid in shown) and shown[0][2] < shown[2][2]
+    button.focus()
+    assert button.inner_text() == "Play"
+    page.keyboard.press("Enter")
+    assert button.inner_text() == "Pause"
+    page.wait_for_function("document.querySelectorAll('.moving input')[1].valueAsNumber >= 3")
+    page.keyboard.press("Enter")
+    assert button.inner_text() == "Play"
+    assert page.evaluate("document.documentElement.scrollWidth") <= width
+
+
+def test_the_first_page_moves_by_itself_where_motion_is_welcome(site, browser):
+    context = browser.new_context(reduced_motion="no-preference")
+    page = context.new_page()
+    page.goto((site / "index.html").as_uri())
+    page.wait_for_function("document.querySelectorAll('.moving input')[1].valueAsNumber >= 2")
+    context.close()
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_the_button_can_be_read_in_light_and_in_dark(site, browser, scheme):
+    context = browser.new_context(color_scheme=scheme, reduced_motion="reduce")
+    page = context.new_page()
+    page.goto((site / "index.html").as_uri())
+    colours = page.locator(".moving button").evaluate(
+        "button => [getComputedStyle(button).color, getComputedStyle(button).backgroundColor]"
+    )
+    context.close()
+    light = [_luminance(*map(float, re.findall(r"[\d.]+", colour)[:3])) for colour in colours]
+    assert (max(light) + 0.05) / (min(light) + 0.05) >= 4.5
+    assert (light[0] > light[1]) == (scheme == "dark")
+
+
+def _luminance(*channels: float) -> float:
+    """The relative luminance of a colour (red, green, blue, 0 to 255), by WCAG 2.1."""
+    linear = [
+        c / 12.92 if c <= 0.03928 else ((c + 0.055) / 1.055) ** 2.4 for c in (x / 255 for x in channels)
+    ]
+    return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
+
+
+def test_the_first_page_shows_the_results_of_the_file(site):
+    page = (site / "index.html").read_text()
+    raw = pd.read_csv(ROOT / "data" / "results" / "table1.csv")
+    ours = raw[raw["algorithm"] == "C2IQL"]
+    rows = dict(re.findall(r"<tr[^>]*>\s*<td><p>(\w+)</p></td>\s*<td><p>([-\d./ ]+)</p></td>", page))
+    assert list(rows) == list(ours["task"].unique())
+    for task, part in ours.groupby("task"):
+        cost = (part["cost"] / part["threshold"]).groupby([part["seed"], part["threshold"]]).mean().mean()
+        assert float(rows[task].split(" / ")[1]) == pytest.approx(cost, abs=0.006)
+
+
+def test_the_first_page_has_commands_licence_citation_source_and_what_is_known_of_other_code(site):
+    page = re.sub(r"\s+", " ", re.sub(r"<[^>]+>", "", (site / "index.html").read_text()))
+    for words in ("make lab", "c2iql train BallCircle", "MIT licence", "Machine Learning Research 267"):
+        assert words in page
+    assert "no public code of the paper’s authors, and of no other public implementation" in page
+
+
+@pytest.mark.parametrize(("name", "folded"), [("problems", 19), ("exam", 8), ("guide", 7)])
+def test_what_is_folded_in_the_pages_for_lecturers_opens_with_its_formulas(site, browser, name, folded):
+    page = browser.new_page(viewport={"width": 390, "height": 900})
+    page.goto((site / f"{name}.html").as_uri())
+    details = page.locator("article details")
+    assert details.count() == folded
+    assert not any(part.is_visible() for part in page.locator("article details > :not(summary)").all())
+    page.evaluate("document.querySelectorAll('article details').forEach(part => { part.open = true; })")
+    text = page.locator("article").inner_text()
+    assert "$" not in text and "details" not in text and page.locator("mjx-merror").count() == 0
+    assert page.evaluate("document.documentElement.scrollWidth") <= 390
+    page.close()

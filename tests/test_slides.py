@@ -104,11 +104,12 @@ def sample_page(tmp_path, browser):
 def test_a_key_moves_a_slider_and_turns_no_page(sample_page):
     sample_page.evaluate("Reveal.slide(0, Reveal.getTotalSlides() - 1)")
     picture = sample_page.locator(".moving img")
-    before = picture.get_attribute("src"), sample_page.url
     sample_page.evaluate("while (Reveal.availableFragments().next) Reveal.next()")
     slider = sample_page.locator(".moving input").first
     slider.wait_for(state="visible")
+    sample_page.wait_for_function("location.hash")  # reveal.js writes it a little later
     sample_page.wait_for_timeout(500)  # it fades in
+    before = picture.get_attribute("src"), sample_page.url
     slider.focus()
     sample_page.keyboard.press("ArrowRight")
     assert picture.get_attribute("alt") == "Two bars: limit 10, start 0.25."

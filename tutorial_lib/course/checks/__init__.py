@@ -14,6 +14,7 @@ from tutorial_lib.course.checks.cmdp import *
 from tutorial_lib.course.checks.conditioning import *
 from tutorial_lib.course.checks.discounting import *
 from tutorial_lib.course.checks.failures import *
+from tutorial_lib.course.checks.from_scratch import *
 from tutorial_lib.course.checks.iql import *
 from tutorial_lib.course.checks.penalty import *
 from tutorial_lib.course.checks.reconstruction import *

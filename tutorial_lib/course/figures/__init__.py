@@ -9,6 +9,7 @@ from tutorial_lib.course.figures.conditioning import *
 from tutorial_lib.course.figures.discounting import *
 from tutorial_lib.course.figures.episodes import *
 from tutorial_lib.course.figures.failures import *
+from tutorial_lib.course.figures.from_scratch import *
 from tutorial_lib.course.figures.luck import *
 from tutorial_lib.course.figures.maximisation_bias import *
 from tutorial_lib.course.figures.method_map import *
