@@ -165,8 +165,14 @@ def test_it_runs_as_a_module():
         (["collect", "AntCircl"], "unknown task 'AntCircl': did you mean AntCircle"),
         (["train", "SAC", "BallRun"], "unknown algorithm 'SAC': the algorithms are IQL"),
         (["train", "BallRun", "CarRun"], "unknown algorithm 'BallRun': the algorithms are IQL"),
-        (["train", "BallRun", "--profile", "huge"], "unknown profile 'huge': the profiles are paper, small, printed"),
-        (["train", "BallRun", "--profile=huge"], "unknown profile 'huge': the profiles are paper, small, printed"),
+        (
+            ["train", "BallRun", "--profile", "huge"],
+            "unknown profile 'huge': the profiles are paper, small, printed",
+        ),
+        (
+            ["train", "BallRun", "--profile=huge"],
+            "unknown profile 'huge': the profiles are paper, small, printed",
+        ),
         (["train", "--updates", "5", "AntRun"], "write the task before the options: c2iql train [ALGORITHM]"),
         (["train", "BallRun", "--seeds", "-2"], "--seeds: each must be from 0 to 2^63 - 1"),
         (["train", "BallRun", "--seeds"], "--seeds: give at least one"),

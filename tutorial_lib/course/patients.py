@@ -157,7 +157,7 @@ class ForgetfulCloning(BCBudget):
         return ForgetfulPlayer(self, limits, run)
 
 
-TASK = dataclasses.replace(laps.TASK, obs_dim=len(WORLD.initial), act_dim=WORLD.rewards.shape[1])
+ONE_HOT_TASK = dataclasses.replace(laps.TASK, obs_dim=len(WORLD.initial), act_dim=WORLD.rewards.shape[1])
 """The laps as a task of the library: the observation is one-hot, and so is the action, with 0.8 for 1."""
 ONE_HOT = 0.8
 
@@ -174,7 +174,7 @@ def _dataset(rows: Rows) -> Dataset:
 def _cloner(kind: type[BCBudget]) -> BCBudget:
     """Returns an agent of the library, trained on the recordings in some seconds."""
     options = kind.configure(updates=1500, hidden_width=32, normalise_observations=False, policy_lr=5e-3)
-    agent = kind(TASK, options)
+    agent = kind(ONE_HOT_TASK, options)
     training.train(agent, _dataset(recordings()), progress=False)
     return agent
 

@@ -97,8 +97,7 @@ def collect(
     kept = thin(costs, returns, of_source, recipe.episodes, *bounds, return_bins=recipe.return_bins)
     chosen = episodes.iloc[kept]
     attributes = _origin(task, recipe) | _counts(names, chosen, len(episodes), recipe, runs, before)
-    written = write_dataset(out, _read(chosen, task), task, attributes, MANTISSA_BITS)
-    return read_dataset(written, task)
+    return read_dataset(write_dataset(out, _read(chosen, task), task, attributes, MANTISSA_BITS), task)
 
 
 def _counts(
