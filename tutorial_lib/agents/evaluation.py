@@ -22,8 +22,8 @@ from tutorial_lib.costs.conditioning import ConditioningConfig
 from tutorial_lib.networks import Critics
 from tutorial_lib.tasks import Task
 
-FINITE_LIMITS = 41
-"""The number of finite limits among which `limits_to_tell` lets an agent choose."""
+LIMITS_TO_TELL = 41
+"""The number of limits among which `limits_to_tell` lets an agent choose."""
 
 
 @dataclass(frozen=True)
@@ -35,10 +35,10 @@ class EvaluationConfig(ConditioningConfig):
     are none. They need `clock=True`."""
     tell: Literal["left", "predicted", "throughout", "switch"] = "left"
     """Which limit the policy is told at each step. With 'left', it is what is left of the limit (eq. 23).
-    With 'predicted', it is the largest limit for which the evaluators predict no more cost than is left. The
-    other two are controls. With 'throughout', it is the limit itself at every step, so that nothing counts
-    the cost. With 'switch', it is infinity as long as anything is left, and then zero, so that the network
-    knows of no limit between the two."""
+    With 'predicted', it is the largest finite limit for which the evaluators predict no more cost than is
+    left. The other two are controls. With 'throughout', it is the limit itself at every step, so that nothing
+    counts the cost. With 'switch', it is infinity as long as anything is left, and then zero, so that the
+    network knows of no limit between the two."""
 
     def __post_init__(self):
         super().__post_init__()
@@ -80,8 +80,11 @@ def evaluation_loss(net: Networks, batch: Fields, s: Tensor, s_next: Tensor, tas
 
 
 def limits_to_tell(task: Task) -> np.ndarray:
-    """Returns the limits that an agent can be told, (n,): from zero to the cost range, and infinity."""
-    return np.append(np.linspace(0, task.cost_range, FINITE_LIMITS), np.inf)
+    """Returns the limits that an agent can choose to be told, (n,): from zero to the task's cost range.
+
+    Infinity is not among them. A policy that is told infinity may go where no limit is kept afterwards.
+    """
+    return np.linspace(0, task.cost_range, LIMITS_TO_TELL)
 
 
 def largest_that_fits(limits: np.ndarray, costs: np.ndarray, left: np.ndarray) -> np.ndarray:
