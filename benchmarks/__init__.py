@@ -18,13 +18,12 @@ import psutil
 import torch
 from tqdm.auto import tqdm
 
-from benchmarks.cases import TASKS, groups, measure, side_by_side
+from benchmarks.cases import SIZES, TASKS, groups, measure, side_by_side
 from benchmarks.peers import install
 from benchmarks.simulation import simulation
 from benchmarks.tables import FILES, FOLDER, part_shares, with_shares
 from benchmarks.updates import PARTS, PRODUCT, Case, Device
 from tutorial_lib.agents import get_algorithm
-from tutorial_lib.config import PROFILES
 from tutorial_lib.files import written_whole
 from tutorial_lib.matmul import bfloat16_time
 from tutorial_lib.tasks import Task, get_task
@@ -44,7 +43,7 @@ def bench(
     """
     workers = workers or joblib.cpu_count()  # the number of cores that this process may use
     kinds: tuple[dict[str, Any], ...] = ({}, {"runs": 3}, {"products": "bfloat16"})
-    cases = [Case("C2IQL", task.name, profile, **kind) for profile in PROFILES for kind in kinds]
+    cases = [Case("C2IQL", task.name, profile, **kind) for profile in SIZES for kind in kinds]
     with tqdm(total=(rounds + 1) * (len(cases) + 6), desc="measuring", leave=False) as bar:
         return (
             training(cases, rounds, seconds, device, bar.update),

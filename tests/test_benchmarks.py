@@ -468,7 +468,7 @@ def test_a_machine_without_cuda_says_so(monkeypatch):
 
 def test_it_prints_both_tables(monkeypatch, capsys):
     tiny = C2IQL.configure("small", hidden_width=8, hidden_layers=1, batch_size=8, crm_width=8, crm_layers=1)
-    monkeypatch.setattr(benchmarks, "PROFILES", ("small",))
+    monkeypatch.setattr(benchmarks, "SIZES", ("small",))
     monkeypatch.setattr(C2IQL, "configure", lambda profile: tiny)
     command.main("BallRun", workers=1, rounds=1)
     lines = [line.split() for line in capsys.readouterr().out.splitlines()]
