@@ -162,6 +162,8 @@ class Slow:
 
     def losses(self, batch):
         config, sums = self.agent.config, {}
+        finite = zip(batch["limit"].tolist(), batch["costs_to_go"].tolist(), strict=True)
+        owns = sum(math.isinf(limit) or limit == cost for limit, cost in finite) / B
         self.untouched = []  # both advantages of each action for which nothing is paid
 
         def add(name, value):
@@ -204,6 +206,9 @@ class Slow:
                 w = weight(config.kappa_2)
             else:
                 w = min(100.0, math.exp(config.awr_alpha * u * 1000 / (TASK.max_return - TASK.min_return)))
+            own = math.isinf(limit) or limit == x.costs_to_go
+            if getattr(config, "policy_thresholds", "all") == "own":
+                w *= own / owns
             add("policy_loss", -w * self.log_prob(s, a))
             for k in range(getattr(config, "evaluators", 0)):
                 add("evaluators_loss", self.evaluation_error(k, x, s, a, s_next) ** 2)
@@ -225,6 +230,7 @@ VARIANTS = [
     {"unsafe_price": 0.5, "price_unit": "advantage"},
     {"clock": True, "time_limits": "mask"},
     {"clock": True, "time_limits": "mask", "unsafe_price": 0.5, "price_unit": "advantage"},
+    {"clock": True, "time_limits": "mask", "thresholds": "range", "policy_thresholds": "own"},
     {"clock": True, "time_limits": "mask", "evaluators": 1},
     {"clock": True, "time_limits": "mask", "evaluators": 2, "evaluated_critic": "mean"},
     {"cost_critics": 1},
@@ -434,6 +440,26 @@ def test_the_exchange_rate_follows_the_ratio_of_the_spreads():
 def test_a_clock_needs_limits_on_the_remaining_cost():
     with pytest.raises(ValueError, match="clock=True needs time_limits='mask'"):
         make_agent("C2IQL", clock=True)
+
+
+def test_a_policy_of_own_thresholds_learns_nothing_from_other_rows():
+    options = {"clock": True, "time_limits": "mask", "thresholds": "range"}
+    with pytest.raises(ValueError, match="policy_thresholds='own' needs thresholds='range' and clock=True"):
+        make_agent("C2IQL", policy_thresholds="own")
+    few = torch.arange(B) < 3
+    for kind, same in (("own", True), ("all", False)):
+        states = []
+        for others in (-0.5, 0.5):  # the actions of the rows that pay something else than they are told
+            agent = make_agent("C2IQL", policy_thresholds=kind, **options)
+            agent.prepare([toy_dataset()], progress=False)
+            batch = random_batch(agent, limit=torch.full((1, B), 4.5))
+            costs = torch.where(few, 4.5, 2.0)[None]
+            actions = torch.where(few[None, :, None], batch["actions"], others)
+            one_update(agent, batch | {"costs_to_go": costs, "actions": actions})
+            states.append(agent.state())
+        policy = [key for key in states[0] if key.startswith("online.policy.")]
+        assert policy
+        assert all(torch.equal(states[0][key], states[1][key]) for key in policy) == same
 
 
 def test_evaluators_need_a_clock_and_the_rule_needs_evaluators():

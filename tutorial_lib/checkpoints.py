@@ -25,7 +25,7 @@ METRICS = "metrics.csv"
 NEWER_OPTIONS: dict[str, Any] = {
     "thresholds": "set", "infinite_share": 0.15, "zero_share": 0.1, "episode_share": 0.5,
     "clock": False, "price_unit": "return", "evaluated_critic": "highest", "evaluators": 0, "tell": "left",
-    "first_guess": "data",
+    "first_guess": "data", "policy_thresholds": "all",
 }  # fmt: skip
 """The options that the shipped agents' files do not name yet, and what these agents were trained with."""
 DAMAGED = (

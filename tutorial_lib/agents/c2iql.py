@@ -13,7 +13,8 @@ Departures:
 5. In profile `small`, the reconstruction model is trained with more noise (`crm_noise_rate`), because the
    paper's noise is smaller than the critics' error.
 6. Not in the paper, and off unless they are asked for: `clock`, `thresholds='range'`, a price in units of the
-   advantages' spread (`price_unit`), `evaluated_critic='mean'`, and `evaluators` with `tell='predicted'`.
+   advantages' spread (`price_unit`), `evaluated_critic='mean'`, `policy_thresholds='own'`, and `evaluators`
+   with `tell='predicted'`.
 
 The paper leaves points 2 to 4 open. The text of each option says what is known of it.
 
@@ -218,7 +219,7 @@ class C2IQL(ConstrainedAgent):
         cost_critic_loss = losses.td_loss(cost_target, net.cost_critics(s, a))
 
         # Lines 19-20: policy extraction.
-        weight = losses.expectile_weight(q - v, config.kappa_2)
+        weight = losses.expectile_weight(q - v, config.kappa_2) * self.extracted(batch)
         policy_loss = losses.policy_loss(weight, gaussian_log_prob(a, *net.policy(s)))
 
         of_networks = {"value": value_loss, "cost_value": cost_value_loss, "critic": critic_loss}
@@ -226,6 +227,17 @@ class C2IQL(ConstrainedAgent):
         if self.evaluates:
             of_networks["evaluators"] = evaluation.evaluation_loss(net, batch, s, s_next, self.task)
         return of_networks, self.logged(cost, limit, v, q_reward, v_cost) | {"cost_mean": cost.mean()}
+
+    def extracted(self, batch: Fields) -> Tensor | float:
+        """Returns the weights of transitions in the policy's loss, (B,), with a mean of 1, or 1.
+
+        With `policy_thresholds='own'`, a transition counts if its limit is infinite, or is what its own
+        episode still costs.
+        """
+        if not self.conditioned or self.config.policy_thresholds == "all":
+            return 1.0
+        own = ((batch.limit == batch.costs_to_go) | batch.limit.isinf()).float()
+        return own / own.mean().clamp(min=1e-6)
 
     def player(self, limits: Sequence[float] | np.ndarray, seeds: Sequence[int], run: int = 0) -> Player:
         return BudgetPlayer(self, limits, run) if self.conditioned else super().player(limits, seeds, run)

@@ -34,6 +34,11 @@ class ConditioningConfig(Config):
     episode still has (rescaled to a whole episode where there is no `clock`). Such pairs of state and
     threshold occur, and uniform ones mostly do not. But an episode can cost little by luck, so that all
     thresholds of this kind would promise too much."""
+    policy_thresholds: Literal["all", "own"] = "all"
+    """The thresholds under which the policy is extracted. With 'own', the policy learns only from transitions
+    whose threshold is what their own episode still costs, or infinite. Then the recorded action is known to
+    fit the threshold. With 'all', it learns from the actions of many plans at once, and the mean of a
+    Gaussian policy lies between them. Needs thresholds='range' and a `clock`."""
     clock: bool = False
     """If true, the networks also see the share of the episode that is over, and a threshold shrinks by every
     recorded cost: after a step of cost c, a threshold L has become max(L - c, 0). A threshold is then a limit
@@ -55,6 +60,11 @@ class ConditioningConfig(Config):
         "small": {"zero_threshold": True},
         "printed": {"thresholds_per": "batch", "infinite_at_test": "never"},
     }
+
+    def __post_init__(self):
+        super().__post_init__()
+        if self.policy_thresholds == "own" and not (self.clock and self.thresholds == "range"):
+            raise ValueError("policy_thresholds='own' needs thresholds='range' and clock=True")
 
 
 INFINITE_CODE = 1.5
