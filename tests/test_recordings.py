@@ -1,6 +1,7 @@
 """What is counted in recordings, against slow loops and a linear programme."""
 
 import dataclasses
+from pathlib import Path
 
 import matplotlib
 import numpy as np
@@ -8,8 +9,10 @@ import pytest
 from scipy.optimize import linprog
 
 from tutorial_lib.course import checks, figures, widgets
+from tutorial_lib.course.checks import recordings as exercises
 from tutorial_lib.data import recordings
-from tutorial_lib.data.dataset import Dataset, returns_to_go
+from tutorial_lib.data.checks import Report, check_dataset
+from tutorial_lib.data.dataset import KEYS, Dataset, returns_to_go
 from tutorial_lib.tasks import DSRL_FRONTIER, TASKS, get_task
 
 
@@ -187,9 +190,46 @@ def test_at_the_wall_counts_and_averages_per_bin():
 
 
 def test_to_go_draws_both_lines():
-    (ax,) = figures.to_go(np.arange(3), np.array([3, 2, 1]), np.array([4, 4, 4]), 2.0).axes
+    (ax,) = figures.to_go(np.arange(3), np.array([3, 2, 1]), np.array([4, 4, 4]), np.array([2, 2, 1])).axes
     assert labelled(ax, "the end: nothing follows")[:, 1].tolist() == [3, 2, 1]
+    assert labelled(ax, "the end, as a fit without a clock sees it")[:, 1].tolist() == [2, 2, 1]
     assert labelled(ax, "a cut: the robot goes on at its rate")[:, 1].tolist() == [4, 4, 4]
+
+
+def test_the_plane_by_hand_draws_the_staircase_and_the_mixtures():
+    points = {"A": (0, 4), "B": (1, 2), "C": (2, 6), "E": (4, 12), "F": (6, 11)}
+    (ax,) = figures.plane_by_hand(points, limit=3).axes
+    stairs = dict(labelled(ax, "frontier: best episode within a limit"))
+    mixed = dict(labelled(ax, "best mixture"))
+    assert (stairs[1], stairs[2], stairs[3], stairs[5]) == (4, 6, 6, 12)
+    assert (mixed[0], mixed[2], mixed[3], mixed[7]) == (4, 8, 10, 12)
+    assert {text.get_text() for text in ax.texts} == set(points)
+
+
+def test_by_source_has_a_panel_for_each_with_its_own_episodes(three):
+    counts = {"priced-0": 1, "lagrangian-0": 2}
+    left, right = figures.by_source(three["BallCircle"], counts, get_task("BallCircle")).axes
+    assert left.lines[1].get_xydata().tolist() == [[0, 10]]
+    assert right.lines[1].get_xydata().tolist() == [[40, 50], [60, 20]]
+    assert right.get_title() == "lagrangian-0: 2 episodes"
+
+
+def test_frontier_left_spans_the_draws_and_draws_the_computed_mean():
+    left = {"at random": np.array([[0.2, 0.4], [0.8, 1.0]]), "evenly": np.array([0.9, 1.0])}
+    (ax,) = figures.frontier_left(np.array([10, 100]), left, np.array([0.35, 0.9])).axes
+    drawn, even = ax.containers
+    assert drawn[0].get_xydata() == pytest.approx(np.array([[10, 0.3], [100, 0.9]]))
+    assert even[0].get_ydata().tolist() == [0.9, 1.0]
+    assert labelled(ax, "mean at random, computed")[:, 1].tolist() == [0.35, 0.9]
+
+
+def test_every_figure_says_what_it_shows(three):
+    data, task = three["BallCircle"], get_task("BallCircle")
+    shown = [figures.planes(three, frontier=True), figures.filtered(data, task, 45), figures.visited(three)]
+    shown += [figures.examples_left(three), figures.by_source(data, {"a": 3}, task)]
+    shown += [figures.at_the_wall(np.array([-1, 1]), np.array([0, 1]))]
+    assert all(figure.description for figure in shown)
+    assert "2 of 3 episodes pass" in shown[1].description
 
 
 def test_moving_the_slider_filters_anew(three, capsys):
@@ -210,6 +250,49 @@ def sums(values, terminals, timeouts):
     return np.array(totals)
 
 
+def once(values, ends):
+    return np.diff(np.cumsum(values)[ends], prepend=0.0)
+
+
+def corners(costs, returns):
+    """The frontier, by comparing every episode with every other one."""
+    points = list(zip(costs, returns, strict=True))
+    best = [(c, r) for c, r in points if not any(d <= c and s >= r and (d, s) != (c, r) for d, s in points)]
+    return sorted(set(best))
+
+
+def running_best(costs, returns, first=-np.inf):
+    points, best = [], first
+    for c, r in sorted(zip(costs, returns, strict=True), key=lambda point: (point[0], -point[1])):
+        if r > best:
+            points, best = [*points, (c, r)], r
+    return points
+
+
+def envelope(costs, returns):
+    """The corners that some price chooses: not the whole frontier."""
+    prices = np.linspace(0, 50, 2001)
+    return {(costs[i], returns[i]) for i in (np.argmax(returns - price * costs) for price in prices)}
+
+
+def faults(rows, tell_apart=True, flags=True, places=True):
+    found = set()
+    if flags and rows["terminals"].any():
+        found |= {"flags"}
+    ends = rows["terminals"] | rows["timeouts"] if tell_apart == "either" else rows["timeouts"]
+    inner = np.flatnonzero(~ends[:-1]) if tell_apart else np.arange(len(ends) - 1)
+    if any((rows["next_observations"][i] != rows["observations"][i + 1]).any() for i in inner):
+        found |= {"order"}
+    unsafe = np.abs(10 * rows["next_observations"][:, 0]) > 6
+    if (rows["costs"] != unsafe).any() if places else (rows["costs"] > 1).any():
+        found |= {"costs"}
+    return found
+
+
+def all_faults(rows):
+    return faults(rows, "either")
+
+
 def target(reward, gamma, next_value, terminal, timeout, bootstrap):
     return reward + gamma * next_value * (not terminal) * (bootstrap or not timeout)
 
@@ -223,14 +306,73 @@ def target(reward, gamma, next_value, terminal, timeout, bootstrap):
         (checks.check_episode_sums, lambda v, a, b: sums(v, b, b), "terminal ends"),
         (checks.check_episode_sums, lambda v, a, b: np.add.reduceat(v, [0, *np.flatnonzero(a | b)[:-1] + 1]),
          "unfinished tail"),
+        (checks.check_episode_sums, lambda v, a, b: once(v, np.sort([*a.nonzero()[0], *b.nonzero()[0]])),
+         "both flags ends one"),
+        (checks.check_episode_sums, lambda v, a, b: once(v, np.flatnonzero(a + b)), "OK"),
         (checks.check_backup_target, target, "OK  target is right"),
+        (checks.check_backup_target, lambda r, g, v, a, b, c: r if a or (b and not c) else r + g * v, "OK"),
+        (checks.check_backup_target, lambda r, g, v, *flags: v, "r + gamma V"),
+        (checks.check_backup_target, lambda r, g, v, *flags: max(r, v), "r + gamma V"),
+        (checks.check_backup_target, lambda r, g, v, *flags: r * v, "r + gamma V"),
+        (checks.check_backup_target, lambda r, g, v, *flags: r + v, "r + gamma V"),
+        (checks.check_backup_target, lambda r, g, v, *flags: (1 - g) * r + g * v, "r + gamma V"),
         (checks.check_backup_target, lambda r, g, v, *flags: r + g * v, "after a terminal"),
         (checks.check_backup_target, lambda r, g, v, a, b, c: target(r, g, v, a, b, True), "stops at"),
         (checks.check_backup_target, lambda r, g, v, a, b, c: target(r, g, v, a or b, b, c), "looks through"),
         (checks.check_backup_target, lambda r, g, v, a, b, c: target(r, g, v, a and not b, b, c), "a fall"),
         (checks.check_backup_target, lambda *arguments: None, "returns nothing"),
+        (checks.check_frontier, corners, "OK  corners is right"),
+        (checks.check_frontier, running_best, "OK  running_best is right"),
+        (checks.check_frontier, lambda c, r: np.array(corners(c, r))[::-1], "OK"),
+        (checks.check_frontier, lambda c, r: set(corners(c, r)), "OK"),
+        (checks.check_frontier, lambda c, r: [np.array(point) for point in corners(c, r)], "OK"),
+        (checks.check_frontier, envelope, "although a mixture earns more"),
+        (checks.check_frontier, lambda c, r: list(zip(c, r, strict=True)), "earns less"),
+        (checks.check_frontier, lambda c, r: running_best(c, r, 0.0), "can be negative"),
+        (checks.check_frontier, lambda c, r: [(c[i], r[i]) for i in range(len(c)) if all(r[i] > r[:i])],
+         "any order"),
+        (checks.check_frontier, lambda c, r: [(k, r[c <= k].max()) for k in np.unique(c)], "earns less"),
+        (checks.check_frontier, lambda c, r: np.array(corners(c, r)).T, "expected"),
+        (checks.check_frontier, lambda c, r: len(corners(c, r)), "expected"),
+        (checks.check_frontier, lambda c, r: None, "returns nothing"),
+        (checks.check_frontier, lambda c, r: c[99], "IndexError"),
+        (checks.check_find_faults, all_faults, "OK  all_faults is right"),
+        (checks.check_find_faults, lambda rows: sorted(all_faults(rows)), "OK"),
+        (checks.check_find_faults, lambda rows: tuple(all_faults(rows)), "OK"),
+        (checks.check_find_faults, lambda rows: faults(rows, False), "another episode"),
+        (checks.check_find_faults, lambda rows: faults(rows, "either", flags=False), "cannot fall"),
+        (checks.check_find_faults, lambda rows: faults(rows, "either", places=False), "look at the places"),
+        (checks.check_find_faults, lambda rows: faults(rows), "found flags, order, expected flags"),
+        (checks.check_find_faults, lambda rows: {"time limits"}, "the names are"),
+        (checks.check_find_faults, lambda rows: "order", "recording 1: found order, expected no fault"),
+        (checks.check_find_faults, lambda rows: 7, "no set of names"),
+        (checks.check_find_faults, lambda rows: None, "empty set"),
+        (checks.check_find_faults, lambda rows: rows["speed"], "KeyError"),
     ],
 )  # fmt: skip
 def test_exercises_tell_the_right_answer_from_each_mistake(checker, answer, said, capsys):
     checker(answer)
     assert said in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("unsafe", [(12, 7), (1, 0)])
+def test_the_recordings_of_the_exercise_are_what_the_reader_accepts_or_not(unsafe):
+    """`c2iql data check` finds their faults; but no running total that is never above 1."""
+    found = {}
+    for fault in ((), ("flags",), ("order",), ("costs",)):
+        rows = exercises.spoiled(exercises.small_recording(unsafe), *fault)
+        report = Report(Path("recording.hdf5"))
+        check_dataset(Dataset(**rows), get_task("BallCircle"), report)
+        found[fault] = " ".join(report.errors + report.warnings)
+    assert found[()] == ""
+    assert "robot cannot fall" in found[("flags",)]
+    assert "not the next row's observations" in found[("order",)]
+    assert ("running totals" in found[("costs",)]) == (max(unsafe) > 1)
+
+
+def test_a_spoiled_recording_leaves_the_good_one_as_it_is():
+    good = exercises.small_recording()
+    before = {key: values.copy() for key, values in good.items()}
+    bad = exercises.spoiled(good, *exercises.RECORDING_FAULTS)
+    assert all(np.array_equal(good[key], before[key]) for key in KEYS)
+    assert bad["costs"].max() == 12 and bad["costs"][200] == 0  # the total begins anew in every episode

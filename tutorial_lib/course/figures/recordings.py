@@ -10,6 +10,7 @@ from tutorial_lib.style import (
     LIMIT,
     NEUTRAL,
     REWARD,
+    described,
     legend_below,
     one_figure,
     subplots,
@@ -46,7 +47,16 @@ def planes(datasets: dict, frontier: bool = False):
     for ax in axes[:, 0]:
         ax.set_ylabel("return")
     legend_below(figure, *axes.flat)
-    return figure
+    text = (
+        f"The cost-return plane of {', '.join(datasets)}: a dot for every recorded episode, with its cost to "
+        "the right and its return upwards. Dashed lines are the thresholds of the task."
+    )
+    if frontier:
+        text += (
+            " A staircase is the best return of the episodes within each limit. A dotted line above it is "
+            "the best mixture of episodes. Diamonds are the best returns of DSRL's data."
+        )
+    return described(figure, text)
 
 
 @one_figure
@@ -78,7 +88,11 @@ def filtered(dataset, task: Task, limit: float):
     over.axvline(limit, **DASHED)
     over.set(title="over all limits", xlabel="limit", ylim=(0, 1.05))
     legend_below(figure, plane, over)
-    return figure
+    text = (
+        f"Left: every episode by its cost and its return. {words}; the others are greyed. Right: a larger "
+        "limit lets more episodes pass, and their best return rises more slowly than their number."
+    )
+    return described(figure, text)
 
 
 @one_figure
@@ -99,7 +113,11 @@ def visited(datasets: dict):
         ax.set_ylabel("y (m)")
     figure.colorbar(picture, ax=axes, label="steps per bin", shrink=0.8)
     legend_below(figure, axes[0, 0])
-    return figure
+    text = (
+        f"Where the robots of {', '.join(datasets)} were, seen from above: a bin is darker the more recorded "
+        "steps end in it. Lines are the edges of the cost zones. White places are in no recording."
+    )
+    return described(figure, text)
 
 
 @one_figure
@@ -122,7 +140,11 @@ def examples_left(datasets: dict, share: float = 0.9):
     for ax in axes[:, 0]:
         ax.set_ylabel("episodes")
     legend_below(figure, axes[0, 0])
-    return figure
+    text = (
+        f"For each threshold of {', '.join(datasets)}, a grey bar counts the episodes that keep it, and a "
+        f"blue bar those of them that earn at least {share:.0%} of the best. Its number stands on it."
+    )
+    return described(figure, text)
 
 
 @one_figure
@@ -137,26 +159,114 @@ def at_the_wall(push, crossed, bins: int = 8):
     shares = np.bincount(place, weights=crossed, minlength=bins) / np.maximum(counts, 1)
     figure, axes = subplots(1, 2, figsize=(12, 4.2))
     middles, width = (edges[1:] + edges[:-1]) / 2, 0.92 * (edges[1] - edges[0])
-    axes[0].bar(middles, counts, width, color=NEUTRAL)
+    axes[0].bar_label(axes[0].bar(middles, counts, width, color=NEUTRAL), fontsize=12)
     axes[1].bar(middles, shares, width, color=COST)
-    axes[0].set(title="what was tried: recorded steps", yscale="log")
-    axes[1].set(title="what came of it: share that crosses the wall", ylim=(0, 1))
+    axes[0].set(title="what was tried", ylabel="recorded steps", ylim=(0, 1.1 * counts.max()))
+    axes[1].set(title="what came of it", ylabel="share that soon crosses the wall", ylim=(0, 1))
     for ax in axes:
         ax.set(xlabel="push: -1 brakes, 1 goes for the wall", xticks=(-1, -0.5, 0, 0.5, 1))
-    return figure
+    text = (
+        f"Left: the number of recorded steps for {bins} ranges of the push towards the wall, from full "
+        f"braking ({counts[0]} steps) to full speed ahead ({counts[-1]} steps). Right: the share that "
+        f"soon crosses the wall, from {shares[0]:.0%} to {shares[-1]:.0%}."
+    )
+    return described(figure, text)
 
 
 @one_figure
-def to_go(steps, masked, continued, level: float):
+def to_go(steps, masked, continued, fitted):
     """Draws the mean discounted return-to-go at each step, for two treatments of the end of a recording.
 
     The first treatment takes it as the end of the episode. The second takes it as a cut, after which the
-    robot continues at its rate.
+    robot continues at its rate. `fitted` is what a model of the observation learns from the first. All are
+    (T,), in discounted reward.
     """
     figure, ax = subplots(figsize=(11, 4.4))
     ax.plot(steps, continued, color=REWARD, label="a cut: the robot goes on at its rate")
     ax.plot(steps, masked, color=COST, label="the end: nothing follows")
-    ax.axhline(level, color=NEUTRAL, linewidth=1.5, label="its mean over the steps")
+    ax.plot(steps, fitted, color=COST, linestyle=":", label="the end, as a fit without a clock sees it")
     ax.set(xlabel="step", ylabel="discounted return to go", ylim=(0, None))
     legend_below(figure, ax)
-    return figure
+    text = (
+        "The mean discounted return to go over the steps of an episode. If the robot goes on after the time "
+        "limit, it stays about level. If nothing follows, it falls to zero at the last step. A fit that sees "
+        "only the observation stays level and lower."
+    )
+    return described(figure, text)
+
+
+@one_figure
+def plane_by_hand(episodes: dict[str, tuple[float, float]], limit: float):
+    """Draws a few named episodes (cost, return), their frontier, their best mixtures, and a limit."""
+    figure, ax = subplots(figsize=(9, 4.8))
+    costs, returns = np.array(list(episodes.values()), float).T
+    limits = np.linspace(0, costs.max() + 1, 701)
+    best = np.array([returns[costs <= one].max(initial=-np.inf) for one in limits])
+    points = list(episodes.values())
+    chords = [
+        np.interp(limits, (left[0], right[0]), (left[1], right[1]), left=-np.inf)
+        for left in points
+        for right in points
+        if left[0] < right[0]
+    ]
+    mixed = np.maximum.reduce([best, *chords])  # the upper envelope
+    ax.step(limits, best, where="post", color=REWARD, label="frontier: best episode within a limit")
+    ax.plot(limits, mixed, color=REWARD, linewidth=1.5, linestyle=":", label="best mixture")
+    ax.plot(costs, returns, "o", color=NEUTRAL, markersize=9, label="episode")
+    for name, (cost, earned) in episodes.items():
+        ax.annotate(name, (cost, earned), xytext=(7, -16), textcoords="offset points", fontsize=14)
+    ax.axvline(limit, **DASHED, label="limit")
+    ax.set(xlabel="cost", ylabel="return", ylim=(0, 1.1 * returns.max()))
+    legend_below(figure, ax)
+    text = (
+        f"{len(episodes)} episodes on the cost-return plane. A staircase joins those on the frontier. A "
+        "dotted line joins the corners of the best mixtures and lies on the staircase or above it."
+    )
+    return described(figure, text)
+
+
+@one_figure
+def by_source(dataset, counts: dict[str, int], task: Task):
+    """Draws every episode by its cost and its return, with one panel for each source of the dataset.
+
+    `counts` is {source: number of its episodes}, in the order of the episodes. Grey dots are the episodes of
+    all other sources.
+    """
+    figure, axes = subplots(1, len(counts), figsize=(6 * len(counts), 4.4), squeeze=False, sharey=True)
+    costs, returns = dataset.episode_costs, dataset.episode_returns
+    first = 0
+    for ax, (source, count) in zip(axes[0], counts.items(), strict=True):
+        own = np.arange(first, first + count)
+        first += count
+        ax.plot(costs, returns, color=NEUTRAL, **(DOTS | {"alpha": 0.15}))
+        ax.plot(costs[own], returns[own], color=REWARD, **(DOTS | {"alpha": 0.7}))
+        ax.set(title=f"{source}: {count} episodes", xlabel="cost", xticks=[0, *task.thresholds])
+    axes[0, 0].set_ylabel("return")
+    named = " and ".join(f"{count} episodes of {source}" for source, count in counts.items())
+    return described(figure, f"The cost-return plane of {task.name}, with {named} in blue.")
+
+
+@one_figure
+def frontier_left(numbers, left: dict[str, np.ndarray], exact):
+    """Draws the share of the frontier that is left over the number of episodes that are kept (k,).
+
+    `left` is {kind of thinning: shares (k,) or (k, draws)}, and `exact` (k,) is the computed mean for one.
+    Bars span the lowest and the highest of several draws.
+    """
+    figure, ax = subplots(figsize=(10, 4.6))
+    for (kind, shares), colour in zip(left.items(), (COST, REWARD), strict=False):
+        shares = np.asarray(shares).reshape(len(numbers), -1)
+        mean = shares.mean(1)
+        span = [mean - shares.min(1), shares.max(1) - mean]
+        ax.errorbar(numbers, mean, span, fmt="o", capsize=4, color=colour, label=kind)
+    ax.plot(numbers, exact, color=COST, linewidth=1.5, label="mean at random, computed")
+    ax.axhline(1, **DASHED, label="all episodes")
+    ax.set(xscale="log", xlabel="episodes that are kept", ylabel="share of the frontier left")
+    ax.set_xticks(numbers, [f"{number:g}" for number in numbers])
+    ax.minorticks_off()
+    legend_below(figure, ax)
+    text = (
+        "The share of the frontier that is left, over the number of episodes that are kept, on a logarithmic "
+        f"axis. It rises towards 1. The kinds of thinning are: {', '.join(left)}."
+    )
+    return described(figure, text)
