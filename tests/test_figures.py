@@ -359,3 +359,19 @@ def test_a_notebook_stores_what_a_figure_shows(monkeypatch):
     figures.method_map("data")._ipython_display_()
     assert shown["metadata"]["image/png"]["alt"].endswith("Lit: data.")
     assert shown["data"].keys() == {"image/png", "text/plain"} and shown["raw"]
+
+
+def test_among_many_systems_the_first_is_drawn_thick_and_all_are_named():
+    parts = [results().assign(algorithm=f"system {n}") for n in range(14)]
+    figure = figures.per_limit(pd.concat(parts))
+    widths = [labelled(ax, f"system {n}").get_linewidth() for ax in figure.axes for n in range(14)]
+    assert min(widths[0], widths[14]) > max(widths[1:14] + widths[15:])
+    (legend,) = figure.legends
+    assert [text.get_text() for text in legend.get_texts()][:14] == [f"system {n}" for n in range(14)]
+    assert "cost equals the limit" in figure.alt_text() and "system 13" in figure.alt_text()
+
+
+def test_a_figure_of_a_study_that_was_not_run_says_so_in_words():
+    empty = results()[:0]
+    for draw in (figures.variants, figures.per_limit, figures.paid_and_earned, figures.against_paper):
+        assert draw(empty).alt_text() == "Nothing is drawn, because the study was not run."

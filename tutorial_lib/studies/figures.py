@@ -1,4 +1,4 @@
-"""The figures of the studies: variants, expectiles, noise, and each task beside the paper's values.
+"""The figures of the studies: variants, expectiles, noise, and every system at every limit.
 
 Every figure is drawn from raw results. In the figures of seeds a small mark is a seed, and a larger mark is
 the mean of the seeds. If the results have no rows, a figure with the decorator `or_not_run` says that the
@@ -6,29 +6,28 @@ study was not run.
 """
 
 import functools
-import itertools
 
 import numpy as np
 import pandas as pd
 
 from tutorial_lib.scores import with_scores
-from tutorial_lib.studies.paper import TABLE1, TABLE2
-from tutorial_lib.studies.results import options_of, seed_interval, seed_means
+from tutorial_lib.studies.paper import TABLE2
+from tutorial_lib.studies.results import options_of, seed_means
 from tutorial_lib.style import (
     COST,
     DASHED,
-    LIMIT,
     NEUTRAL,
     REWARD,
+    described,
     legend_below,
     one_figure,
     subplots,
-    task_panels,
 )
-from tutorial_lib.tasks import Task, get_task
+from tutorial_lib.tasks import Task
 
 VARIANTS = ("#222222", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#8A8A8A", "#F0E442", "#0072B2", "#D55E00")
 MARKS = "Ds^ovPX<>"
+FIGURE_2 = ("C2IQL", "C2IQL (printed)", "CDT")  # the two systems of the paper's Fig. 2, and one as printed
 PANELS = (("reward_score", "normalised return", REWARD), ("cost_score", "normalised cost", COST))
 
 
@@ -42,7 +41,7 @@ def or_not_run(draw):
         figure, ax = subplots(figsize=(9, 1))
         ax.set_axis_off()
         ax.text(0.5, 0.5, "not run: no results to draw", ha="center", va="center", color=NEUTRAL)
-        return figure
+        return described(figure, "Nothing is drawn, because the study was not run.")
 
     return maybe
 
@@ -149,37 +148,6 @@ def noise_levels(results, limit: float = 50):
     return figure
 
 
-@one_figure
-@or_not_run
-def against_paper(results, algorithm: str = "C2IQL"):
-    """Draws every task's return and cost beside the paper's: seeds, and their mean with its 95% interval."""
-    part = seed_means(results[results["algorithm"] == algorithm], ("task",))
-    tasks = list(part["task"].unique())
-    figure, axes = subplots(1, 2, figsize=(12, 4.6))
-    for ax, (score, title, colour), column in zip(axes, PANELS, (0, 1), strict=True):
-        for x, task in enumerate(tasks):
-            dots = part.loc[part["task"] == task, score].to_numpy()
-            _interval_and_dots(ax, x - 0.12, dots, colour, f"ours, {algorithm}")
-            if task in TABLE1.get(algorithm, {}):
-                paper = TABLE1[algorithm][task][column]
-                style = {"color": NEUTRAL, "markersize": 10, "fillstyle": "none", "markeredgewidth": 2}
-                ax.plot(x + 0.2, paper, "o", **style, label="the paper's, on DSRL's data")
-        ax.set_xticks(range(len(tasks)), tasks, rotation=20 if len(tasks) > 4 else 0)
-        ax.set(title=title, xlim=(-0.5, len(tasks) - 0.5))
-    axes[1].axhline(1, **DASHED, label="limit")
-    axes[1].set_ylim(0, None)
-    legend_below(figure, *axes)
-    return figure
-
-
-def _interval_and_dots(ax, x, dots, colour, label):
-    spread = np.linspace(-0.07, 0.07, len(dots)) if len(dots) > 1 else [0]
-    ax.plot(x + spread, dots, "o", color=colour, markersize=6, alpha=0.4, markeredgewidth=0)
-    low, high = seed_interval(dots)
-    bars = [[dots.mean() - low], [high - dots.mean()]] if len(dots) > 1 else None
-    ax.errorbar(x, dots.mean(), bars, fmt="D", color=colour, markersize=9, capsize=6, label=label)
-
-
 def algorithm_looks(results) -> dict[str, dict]:
     """Returns the colour and the marker of each algorithm, by its place in the results.
 
@@ -199,9 +167,12 @@ def per_limit(results):
     """Draws the paper's Fig. 2: return and cost at each limit, a column per task, a line per algorithm."""
     results = with_scores(results)
     tasks, looks = list(results["task"].unique()), algorithm_looks(results)
+    for name, look in looks.items():  # Among many lines the first one must be found.
+        many = len(looks) > 4 and name != next(iter(looks))
+        look |= {"linewidth": 0.8, "markersize": 4} if many else {"linewidth": 1.5}
     columns = min(4, len(tasks))
     blocks = -(-len(tasks) // columns)
-    size = (12, 5.6 * blocks + 0.6)
+    size = (12, 4.0 * blocks + 0.8)
     figure, axes = subplots(2 * blocks, columns, figsize=size, squeeze=False)
     for place, task in enumerate(tasks):
         block, column = divmod(place, columns)
@@ -211,9 +182,7 @@ def per_limit(results):
         for ax, score in zip(axes[2 * block : 2 * block + 2, column], ("reward_score", "cost"), strict=True):
             for name, style in looks.items():
                 if name in means.index.get_level_values(0):
-                    ax.plot(
-                        limits, means.loc[name, score].reindex(limits), **style, linewidth=1.5, label=name
-                    )
+                    ax.plot(limits, means.loc[name, score].reindex(limits), **style, label=name)
             ax.set_xticks(limits)
         axes[2 * block, column].set_title(task)
         axes[2 * block + 1, column].plot([0, limits.max()], [0, limits.max()], **DASHED, label="cost = limit")
@@ -226,37 +195,21 @@ def per_limit(results):
         axes[2 * block + 1, 0].set_ylabel("cost paid")
     for ax in axes[2 * (blocks - 1) :].T[len(tasks) - columns * (blocks - 1) :].flat:
         ax.set_visible(False)
-    legend_below(figure, axes[1, 0])
-    return figure
+    handles = {
+        label: handle
+        for ax in axes.flat
+        for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)
+    }
+    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=min(5, len(handles)))
+    return described(figure, _per_limit_text(tasks, list(looks)))
 
 
-@one_figure
-@or_not_run
-def promises(results):
-    """Draws the predicted cost of an episode against the paid cost, with one panel per task.
-
-    Each mark is the mean of one agent at one limit.
-    """
-    results = results[results["algorithm"].eq("C2IQL") & results["predicted_cost"].notna()]
-    means = results.groupby(["task", "seed", "threshold"])[["predicted_cost", "cost"]].mean().reset_index()
-    tasks = list(results["task"].unique())
-    figure, axes = task_panels(tasks, 3.8)
-    for ax, task in zip(axes.flat, tasks, strict=False):
-        part, names = means[means["task"] == task], get_task(task).cost_limit_names
-        end = 1.1 * part[["predicted_cost", "cost", "threshold"]].to_numpy().max()
-        ax.plot([0, end], [0, end], color=NEUTRAL, linewidth=1.5, label="paid as predicted")
-        looks = zip(itertools.cycle((0.35, 0.65, 1)), itertools.cycle("os^DvPX"), strict=False)
-        for (alpha, mark), (limit, name) in zip(looks, names.items(), strict=False):
-            rows = part[part["threshold"] == limit]
-            style = {"color": COST, "alpha": alpha, "markersize": 9, "label": f"{name} limit"}
-            ax.plot(rows["predicted_cost"], rows["cost"], mark, **style)
-            ax.axhline(limit, color=LIMIT, linestyle=":", linewidth=1, label="the limits")
-        ax.set(xlabel="predicted cost", xlim=(0, end), ylim=(0, end))
-        ax.locator_params(nbins=4)
-    for ax in axes[:, 0]:
-        ax.set_ylabel("paid cost")
-    legend_below(figure, axes[0, 0])
-    return figure
+def _per_limit_text(tasks: list[str], names: list[str]) -> str:
+    """Returns the alternative text of `per_limit`."""
+    return (
+        f"Normalised return and paid cost over the limit, with a column for each of {', '.join(tasks)} and a "
+        f"line for each of {', '.join(names)}. A dashed line shows where the paid cost equals the limit."
+    )
 
 
 @one_figure

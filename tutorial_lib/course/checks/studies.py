@@ -1,12 +1,48 @@
 """This module checks the answers to the exercises of notebooks 13 and 14."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import pandas as pd
 from scipy import stats
 
-from tutorial_lib.course.checks.checker import try_answer
+from tutorial_lib.course.checks.checker import text, try_answer
+
+Case = tuple[tuple, object, str]
+"""The arguments of a call, its right value, and a hint for values that no known mistake gives."""
+Mistake = tuple[Callable, str]
+"""A function that makes a mistake, and the words that name it."""
+
+
+def _try_answer(answer: Callable, cases: Sequence[Case], mistakes: Sequence[Mistake]) -> None:
+    """Prints the first mistake of `answer`, or OK. A value that a known mistake gives is told by its name.
+
+    Unlike `try_answer`, it takes NaN for a right value where NaN is expected.
+    """
+    name = getattr(answer, "__name__", "the answer")
+    for arguments, expected, hint in cases:
+        call = f"{name}({', '.join(text(argument) for argument in arguments)})"
+        try:
+            got = answer(*arguments)
+        except Exception as error:  # the reader's code can raise any error
+            print(f"NOT YET  {call} raised {type(error).__name__}: {error}")
+            return
+        if got is None:
+            print(f"NOT YET  {name} returns nothing: write it in place of the `...`")
+            return
+        if not _equal(got, expected):
+            known = [words for wrong, words in mistakes if _equal(got, wrong(*arguments), 1e-4)]
+            print(f"NOT YET  {call} = {text(got)}, expected {text(expected)}: {(known or [hint])[0]}")
+            return
+    print(f"OK  {name} is right in {len(cases)} cases")
+
+
+def _equal(got, expected, tolerance: float = 1e-6) -> bool:
+    try:
+        close = np.allclose(got, expected, atol=tolerance, equal_nan=True)
+        return bool(np.shape(got) == np.shape(expected) and close)
+    except (TypeError, ValueError):  # `got` has no number, or another shape
+        return False
 
 
 def check_paired_interval(answer: Callable) -> None:
@@ -14,21 +50,105 @@ def check_paired_interval(answer: Callable) -> None:
 
     `answer(first, second)` returns the 95% interval (low, high) of the mean paired difference.
     """
-    cases = []
-    for first, second, hint in (
-        ([0.7, 0.8], [0.6, 0.6], "two seeds: t is 12.71 with one degree of freedom, not 1.96"),
-        ([0.5, 0.7, 0.9], [0.4, 0.6, 0.8], "every pair differs by 0.1: the interval is a point"),
-        ([0.5, 0.9, 0.7], [0.6, 0.6, 0.6], "take the differences seed by seed, and divide by n - 1"),
-        ([0.1, 0.2, 0.4, 0.3, 0.3], [0.3, 0.2, 0.1, 0.1, 0.5], "five seeds have four degrees of freedom"),
+
+    def interval(d, half):
+        return [d.mean() - half, d.mean() + half]
+
+    def unpaired(x, y):
+        found = stats.ttest_ind(x, y).confidence_interval(0.95)
+        return [found.low, found.high]
+
+    def student(d, ddof=1, chance=0.975, root=True):
+        spread = d.std(ddof=ddof) / (len(d) ** 0.5 if root else 1)
+        return interval(d, stats.t.ppf(chance, len(d) - 1) * spread)
+
+    mistakes: list[Mistake] = [
+        (
+            lambda x, y: interval(x - y, 1.959964 * (x - y).std(ddof=1) / len(x) ** 0.5),
+            "1.96 is for many seeds: n seeds have n - 1 degrees of freedom, so take t, which is larger",
+        ),
+        (lambda x, y: student(x - y, ddof=0), "the standard deviation of a sample divides by n - 1"),
+        (lambda x, y: student(x - y, chance=0.95), "95% in the middle leave 2.5% on each side: ppf(0.975)"),
+        (lambda x, y: student(x - y, root=False), "the mean of n values varies less: divide by sqrt(n)"),
+        (lambda x, y: student(y - x), "first - second, in this order"),
+        (unpaired, "the runs share their seeds: take the differences seed by seed, then their interval"),
+    ]
+    cases: list[Case] = []
+    for first, second in (
+        ([0.5, 0.9, 0.7], [0.6, 0.6, 0.5]),
+        ([0.1, 0.2, 0.4, 0.3, 0.3], [0.3, 0.2, 0.1, 0.1, 0.5]),
+        ([0.7, 0.8], [0.6, 0.65]),
     ):
         pair = np.array(first), np.array(second)
-        differences = pair[0] - pair[1]
-        if np.ptp(differences) < 1e-9:
-            expected = np.repeat(differences.mean(), 2)
-        else:
-            expected = np.array(stats.ttest_rel(*pair).confidence_interval(0.95))
-        cases.append((pair, expected, hint))
-    try_answer(answer, cases)
+        expected = np.array(stats.ttest_rel(*pair).confidence_interval(0.95))
+        cases.append((pair, expected, "return the pair (mean - half, mean + half) of the differences"))
+    _try_answer(answer, cases, mistakes)
+
+
+def check_at_equal_cost(answer: Callable) -> None:
+    """Checks an exercise of notebook 13.
+
+    `answer(cost, earned, costs, earnings)` returns what a run earned more than another run at the same paid
+    cost. The other run's costs and earnings (n,) are interpolated linearly. Outside of its costs it is NaN.
+    """
+
+    def clamped(cost, earned, costs, earnings):
+        order = np.argsort(costs)
+        return earned - np.interp(cost, costs[order], earnings[order])
+
+    mistakes: list[Mistake] = [
+        (clamped, "the other run never paid this cost: say nan, and do not extend its line"),
+        (
+            lambda cost, earned, costs, earnings: earned - np.interp(cost, costs, earnings),
+            "np.interp needs rising costs: sort the other run's points by their costs first",
+        ),
+        (lambda *x: -clamped(*x), "what this run earned minus what the other one earned"),
+        (
+            lambda cost, earned, costs, earnings: earned - earnings[np.abs(costs - cost).argmin()],
+            "the nearest point has another cost: interpolate between the two points around the cost",
+        ),
+    ]
+    up, down = np.array([10.0, 20.0, 40.0]), np.array([40.0, 10.0, 20.0])
+    cases: list[Case] = [
+        ((15.0, 0.6, up, np.array([0.4, 0.6, 0.7])), 0.1, "halfway between 0.4 and 0.6 lies 0.5"),
+        ((25.0, 0.6, down, np.array([0.8, 0.4, 0.6])), -0.05, "at a cost of 25 the other run earns 0.65"),
+        ((20.0, 0.6, up, np.array([0.4, 0.6, 0.7])), 0.0, "at one of its own costs the other run is known"),
+    ]
+    for cost in (50.0, 5.0):
+        cases.append(((cost, 0.9, up, np.array([0.4, 0.6, 0.7])), np.nan, mistakes[0][1]))
+    _try_answer(answer, cases, mistakes)
+
+
+def check_hidden_by_the_mean(differences) -> None:
+    """Checks an exercise of notebook 13.
+
+    `differences` (seeds, limits) are a claim's differences. Over the mean of the limits the claim must agree,
+    and under one limit it must be contradicted, each with a 95% interval over at least three seeds.
+    """
+    try:
+        table = np.asarray(differences, float)
+    except (TypeError, ValueError):
+        table = np.zeros(0)
+    if table.ndim != 2 or table.shape[0] < 3 or table.shape[1] < 2 or not np.isfinite(table).all():
+        print("NOT YET  write a table of numbers: a row for each of three seeds or more, a column per limit")
+        return
+    (low, high), columns = _interval(table.mean(1)), [_interval(column) for column in table.T]
+    if low <= 0:
+        side = "contradicts" if high < 0 else "is undecided"
+        print(f"NOT YET  the mean over limits {side}: its interval is {low:.3f} to {high:.3f}")
+    elif all(end >= 0 for _, end in columns):
+        words = ", ".join(f"{start:.3f} to {end:.3f}" for start, end in columns)
+        print(f"NOT YET  no limit contradicts: the intervals are {words}, and one must lie below zero")
+    else:
+        worst = min(range(len(columns)), key=lambda n: columns[n][1])
+        found = f"{columns[worst][0]:.3f} to {columns[worst][1]:.3f}"
+        print(f"OK  the mean agrees ({low:.3f} to {high:.3f}), and limit {worst + 1} contradicts ({found})")
+
+
+def _interval(values: np.ndarray) -> tuple[float, float]:
+    """Returns the 95% interval of the mean of values (seeds,), which is a point where they are equal."""
+    half = stats.t.ppf(0.975, len(values) - 1) * values.std(ddof=1) / len(values) ** 0.5
+    return values.mean() - half, values.mean() + half
 
 
 def check_best_safe(answer: Callable) -> None:
@@ -95,3 +215,82 @@ def check_share_kept(answer: Callable) -> None:
     ):
         cases.append(((np.array(costs, float), limits), expected, hint))
     try_answer(answer, cases)
+
+
+def check_iqm(answer: Callable) -> None:
+    """Checks an exercise of notebook 14.
+
+    `answer(scores)` returns the interquartile mean of all numbers of `scores` (tasks, seeds): the mean of the
+    middle half. Every case has a multiple of four numbers.
+    """
+
+    def middle(scores, axis=None):
+        return stats.trim_mean(scores, 0.25, axis=axis)
+
+    mistakes: list[Mistake] = [
+        (lambda x: np.median(x), "this is the median, which keeps one or two numbers: keep the middle half"),
+        (lambda x: np.mean(x), "this is the mean: one outlier moves it. Drop a quarter at each end first"),
+        (
+            lambda x: np.mean(middle(x, axis=-1)),
+            "sort the numbers of all tasks together, not task by task: tasks compete for the middle half",
+        ),
+        (lambda x: np.sort(x, axis=None)[np.size(x) // 4 :].mean(), "drop a quarter at the upper end, too"),
+        (lambda x: stats.trim_mean(x, 0.1, axis=None), "a quarter at each end, not a tenth"),
+        (
+            lambda x: np.ravel(x)[np.size(x) // 4 : np.size(x) - np.size(x) // 4].mean(),
+            "the middle half of the *sorted* scores",
+        ),
+    ]
+    cases: list[Case] = []
+    for scores, hint in (
+        ([[0.9, 0.1, 0.4, 0.7]], "of 0.1, 0.4, 0.7 and 0.9 the middle two are 0.4 and 0.7"),
+        ([[0.9, 0.8, 0.7, 0.1], [0.5, 0.6, 0.3, -2.0]], "the middle four of the eight sorted scores"),
+        (np.arange(12.0).reshape(4, 3) ** 2, "the middle six of the twelve sorted scores"),
+    ):
+        array = np.array(scores)
+        cases.append(((array,), float(middle(array)), hint))
+    _try_answer(answer, cases, mistakes)
+
+
+def check_undominated(answer: Callable) -> None:
+    """Checks an exercise of notebook 14.
+
+    `answer(earned, paid)` returns for each system (n,) whether no other system earns at least as much and
+    pays at most as much, with one of the two strictly better.
+    """
+
+    def best_safe(earned, paid):
+        return (paid <= 1) & (earned == earned[paid <= 1].max(initial=-np.inf))
+
+    def neither(earned, paid):
+        better = (earned[:, None] > earned) & (paid[:, None] < paid)
+        return ~better.any(0)
+
+    def ties_lose(earned, paid):
+        better = (earned[:, None] >= earned) & (paid[:, None] <= paid) & ~np.eye(len(paid), dtype=bool)
+        return ~better.any(0)
+
+    mistakes: list[Mistake] = [
+        (ties_lose, "two systems that are equal in both do not drop each other"),
+        (best_safe, "this picks the best earner among the safe: who pays less may earn less and stay"),
+        (neither, "as good in one of the two and better in the other is already a reason to drop a system"),
+    ]
+    cases: list[Case] = []
+    for earned, paid, expected, hint in (
+        (
+            [0.9, 0.7, 0.6],
+            [0.8, 0.5, 0.6],
+            [True, True, False],
+            "the second earns more than the third for less",
+        ),
+        (
+            [0.9, 0.9, 0.5],
+            [0.8, 0.9, 0.8],
+            [True, False, False],
+            "ties in one number are decided by the other",
+        ),
+        ([0.5, 0.5], [1.4, 1.4], [True, True], "equal systems stay, also beyond the limit"),
+        ([1.0, 0.8, 0.3], [2.0, 0.9, 0.0], [True, True, True], "more return for more cost is another choice"),
+    ):
+        cases.append(((np.array(earned), np.array(paid)), np.array(expected), hint))
+    _try_answer(answer, cases, mistakes)

@@ -1,4 +1,4 @@
-"""The figures of chance: intervals over episodes, and selected checkpoints, of runs that do not differ."""
+"""The figures of chance: spreads, intervals, selected checkpoints, and summaries over tasks."""
 
 import numpy as np
 from matplotlib import ticker
@@ -6,7 +6,7 @@ from matplotlib import ticker
 from tutorial_lib.data.recordings import best_left
 from tutorial_lib.data.sources import load_dataset
 from tutorial_lib.scores import normalised_return, with_scores
-from tutorial_lib.studies.figures import algorithm_looks
+from tutorial_lib.studies.figures import algorithm_looks, or_not_run
 from tutorial_lib.studies.results import SCORES, seed_interval
 from tutorial_lib.style import (
     COST,
@@ -14,6 +14,7 @@ from tutorial_lib.style import (
     LIMIT,
     NEUTRAL,
     REWARD,
+    described,
     legend_below,
     one_figure,
     subplots,
@@ -128,3 +129,81 @@ def room_left(results):
         ax.set_ylabel("normalised return")
     legend_below(figure, *axes[0])
     return figure
+
+
+@one_figure
+@or_not_run
+def spread_ratios(ratios):
+    """Draws one mark for each task and limit: the spread over seeds in units of what episodes alone explain.
+
+    `ratios` is a series with the levels `task` and `threshold`. Marks without a value are left out.
+    """
+    tasks = list(ratios.index.get_level_values("task").unique())
+    figure, ax = subplots(figsize=(12, 4.2))
+    for x, task in enumerate(tasks):
+        values = ratios.loc[task].sort_index()
+        for place, value in enumerate(values):
+            label = ("small", "middle", "high", "further")[min(place, 3)] + " limit"
+            style = {"color": COST, "alpha": 0.4 + 0.3 * min(place, 2), "markersize": 10, "label": label}
+            ax.plot(x + 0.15 * (place - (len(values) - 1) / 2), value, "os^D"[min(place, 3)], **style)
+    ax.axhline(1, **DASHED, label="seeds differ by their episodes' luck alone")
+    ax.set(ylabel="spread over seeds /\nexpected from episodes", yscale="log")
+    ax.yaxis.set_major_locator(ticker.LogLocator(subs=(1, 2, 5)))
+    ax.yaxis.set_major_formatter("{x:g}")
+    ax.yaxis.set_minor_locator(ticker.NullLocator())
+    ax.set_xticks(range(len(tasks)), tasks, rotation=15)
+    legend_below(figure, ax)
+    words = (
+        "The spread of the normalised cost over seeds, divided by what the luck of episodes explains, at the"
+    )
+    return described(figure, f"{words} limits of {', '.join(tasks)}. The dashed line is at 1.")
+
+
+@one_figure
+@or_not_run
+def aggregates(rows):
+    """Draws a mean over tasks for each system, with its interval, in one panel per limit.
+
+    `rows` has the columns `system`, `limit` (words), `value`, `low`, `high` and `tasks` (a number). A hollow
+    mark stands for a system that was not run on as many tasks as the others.
+    """
+    limits, systems = list(rows["limit"].unique()), list(rows["system"].unique())
+    figure, axes = subplots(
+        1, len(limits), figsize=(12, 0.42 * len(systems) + 1.4), sharex=True, sharey=True, squeeze=False
+    )
+    for ax, limit in zip(axes[0], limits, strict=True):
+        for _, row in rows[rows["limit"] == limit].iterrows():
+            y, whole = systems.index(row["system"]), row["tasks"] == rows["tasks"].max()
+            ax.plot([row["low"], row["high"]], [y, y], color=REWARD, linewidth=1.5)
+            ax.plot(row["value"], y, "D", color=REWARD, markersize=9, fillstyle="full" if whole else "none")
+        ax.set(title=limit, xlabel="normalised return")
+    axes[0, 0].set_yticks(range(len(systems)), systems)
+    axes[0, 0].set_ylim(len(systems) - 0.5, -0.5)
+    words = (
+        "The interquartile mean of the normalised return over tasks and seeds, with 95% intervals, under the"
+    )
+    return described(figure, f"{words} {', '.join(limits)}, for {', '.join(systems)}.")
+
+
+@one_figure
+@or_not_run
+def profiles(results, curves: dict):
+    """Draws performance profiles: the share of runs beyond a score, over that score, one line per system.
+
+    `curves` maps a panel's title to (label of the horizontal axis, grid (G,), {system: shares (G,)}). The
+    looks of the systems are those that they have in `results`.
+    """
+    looks = algorithm_looks(results)
+    first = next(iter(looks))
+    figure, axes = subplots(1, len(curves), figsize=(12, 4.4), sharey=True, squeeze=False)
+    for ax, (title, (label, grid, shares)) in zip(axes[0], curves.items(), strict=True):
+        for name, share in shares.items():
+            look = {"color": looks[name]["color"], "linewidth": 3 if name == first else 1.2}
+            dashes = "-" if list(looks).index(name) < 9 else "--"  # Colours repeat after nine systems.
+            ax.plot(grid, share, dashes, label=name, **look)
+        ax.set(title=title, xlabel=label, ylim=(0, 1.02))
+    axes[0, 0].set_ylabel("share of pairs (seed, limit)")
+    handles = dict(zip(*reversed(axes[0, 0].get_legend_handles_labels()), strict=True))
+    figure.legend(handles.values(), handles, loc="outside lower center", ncols=min(5, len(handles)))
+    words = " and ".join(curves)
+    return described(figure, f"Performance profiles, {words}, with a line for each of {', '.join(looks)}.")
