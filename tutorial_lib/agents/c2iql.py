@@ -36,7 +36,7 @@ from tutorial_lib.agents.evaluation import EvaluationConfig, Evaluators
 from tutorial_lib.agents.implicit import ConstrainedAgent, ConstrainedConfig
 from tutorial_lib.agents.player import BudgetPlayer, Player
 from tutorial_lib.agents.seeds import Fields, Networks
-from tutorial_lib.costs.conditioning import after_step, draw_thresholds, encode
+from tutorial_lib.costs.conditioning import after_step, draw_thresholds, encode, own_thresholds
 from tutorial_lib.costs.reconstruction import (
     CostReconstruction,
     ReconstructionConfig,
@@ -176,10 +176,7 @@ class C2IQL(ConstrainedAgent):
         return self.reconstruction(q_cost)
 
     def untouched(self, cost: Tensor, state_cost: Tensor, limit: Tensor) -> Tensor:
-        """Returns true where the limit is infinite, (B,): no V_r there contains a payment, now or later.
-
-        So the exchange rate does not depend on the price, and cannot raise itself.
-        """
+        """Returns true where the limit is infinite, (B,). No V_r there contains a payment."""
         return limit.isinf() if self.conditioned else super().untouched(cost, state_cost, limit)
 
     def losses(self, net: Networks, batch: Fields) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
@@ -219,7 +216,9 @@ class C2IQL(ConstrainedAgent):
         cost_critic_loss = losses.td_loss(cost_target, net.cost_critics(s, a))
 
         # Lines 19-20: policy extraction.
-        weight = losses.expectile_weight(q - v, config.kappa_2) * self.extracted(batch)
+        weight = losses.expectile_weight(q - v, config.kappa_2)
+        if self.conditioned and config.policy_thresholds == "own":
+            weight = weight * own_thresholds(limit, batch.costs_to_go)
         policy_loss = losses.policy_loss(weight, gaussian_log_prob(a, *net.policy(s)))
 
         of_networks = {"value": value_loss, "cost_value": cost_value_loss, "critic": critic_loss}
@@ -227,17 +226,6 @@ class C2IQL(ConstrainedAgent):
         if self.evaluates:
             of_networks["evaluators"] = evaluation.evaluation_loss(net, batch, s, s_next, self.task)
         return of_networks, self.logged(cost, limit, v, q_reward, v_cost) | {"cost_mean": cost.mean()}
-
-    def extracted(self, batch: Fields) -> Tensor | float:
-        """Returns the weights of transitions in the policy's loss, (B,), with a mean of 1, or 1.
-
-        With `policy_thresholds='own'`, a transition counts if its limit is infinite, or is what its own
-        episode still costs.
-        """
-        if not self.conditioned or self.config.policy_thresholds == "all":
-            return 1.0
-        own = ((batch.limit == batch.costs_to_go) | batch.limit.isinf()).float()
-        return own / own.mean().clamp(min=1e-6)
 
     def player(self, limits: Sequence[float] | np.ndarray, seeds: Sequence[int], run: int = 0) -> Player:
         return BudgetPlayer(self, limits, run) if self.conditioned else super().player(limits, seeds, run)

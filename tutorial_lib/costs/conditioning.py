@@ -112,6 +112,15 @@ def draw_thresholds(
     return torch.where(kind < config.infinite_share, torch.inf, finite)
 
 
+def own_thresholds(threshold: Tensor, costs_to_go: Tensor) -> Tensor:
+    """Returns weights (B,) with a mean of 1, which are zero except for a transition's own thresholds.
+
+    A threshold (B,) is the transition's own if it is what its episode still costs (B,), or infinite.
+    """
+    own = ((threshold == costs_to_go) | threshold.isinf()).float()
+    return own / own.mean().clamp(min=1e-6)
+
+
 def after_step(threshold: Tensor, cost: Tensor) -> Tensor:
     """Returns max(L - c, 0), (B,): what is left of thresholds L (B,) after a step of cost c (B,)."""
     return (threshold - cost).clamp(min=0)
