@@ -105,16 +105,6 @@ def normalised_return(total, task):
     return (total - task.min_return) / (task.max_return - task.min_return)
 
 
-def implicit_cost_value(q, v, q_cost, kappa):
-    weight = np.where(q - v < 0, 1 - kappa, kappa)
-    return (weight * q_cost).sum() / weight.sum()
-
-
-def condition(limit, spent, t, horizon, thresholds):
-    budget = (limit - spent) * horizon / (horizon - t)
-    return min(thresholds, key=lambda threshold: abs(threshold - budget))
-
-
 def run_cost(y, speed, speed_limit):
     return float(abs(y) > 2 or speed > speed_limit)
 
@@ -194,8 +184,6 @@ ANSWERS = {
     checks.check_budget_backup: budget_backup,
     checks.check_keeps_limit: keeps_limit,
     checks.check_normalised_return: normalised_return,
-    checks.check_implicit_cost_value: implicit_cost_value,
-    checks.check_condition: condition,
 }
 MISTAKES = [
     (checks.check_run_cost, lambda y, speed, limit: float(y > 2 or speed > limit), "two walls"),
@@ -235,14 +223,6 @@ MISTAKES = [
     (checks.check_normalised_return, lambda R, task: np.clip(normalised_return(R, task), 0, 1), "clips"),
     (checks.check_normalised_return, lambda R, task: min(normalised_return(R, task), 1), "clips"),
     (checks.check_normalised_return, lambda R, task: max(normalised_return(R, task), 0), "clips"),
-    (checks.check_implicit_cost_value, lambda q, v, c, k: np.where(q < v, 1 - k, k) @ c, "divide by the sum"),
-    (checks.check_implicit_cost_value, lambda q, v, c, k: implicit_cost_value(v, q, c, k), "M is"),
-    (checks.check_implicit_cost_value, lambda q, v, c, k: implicit_cost_value(q, v + 1e-9, c, k), "as good"),
-    (checks.check_condition, lambda L, spent, t, T, choices: condition(L, spent, 0, T, choices), "double"),
-    (checks.check_condition, lambda L, spent, t, T, choices: condition(L, 0, t, T, choices), "rate of 20"),
-    (checks.check_condition, lambda L, spent, t, T, choices: (L - spent) * T / (T - t), "double"),
-    (checks.check_condition, lambda L, spent, t, T, choices: max(
-        [c for c in choices if c <= (L - spent) * T / (T - t)], default=choices[0]), "double"),
 ]  # fmt: skip
 
 

@@ -36,7 +36,7 @@ from tutorial_lib.agents.evaluation import EvaluationConfig, Evaluators
 from tutorial_lib.agents.implicit import ConstrainedAgent, ConstrainedConfig
 from tutorial_lib.agents.player import BudgetPlayer, Player
 from tutorial_lib.agents.seeds import Fields, Networks
-from tutorial_lib.costs.conditioning import after_step, draw_thresholds, encode, own_thresholds
+from tutorial_lib.costs.conditioning import after_step, draw_thresholds, encode, policy_weight
 from tutorial_lib.costs.reconstruction import (
     CostReconstruction,
     ReconstructionConfig,
@@ -188,8 +188,7 @@ class C2IQL(ConstrainedAgent):
         costs = self.episode_cost(q_cost)  # (k, B)
         cost, q_cost = costs.amax(0), self.evaluated_heads(q_cost, costs)  # (B,) and (B, m)
 
-        # Line 18: its target, which is needed here, too: it is the cost of the recorded step.
-        # Eq. 16 prints V_c(s), but V_c(s') is meant.
+        # Line 18: its target, the cost of the recorded step. Eq. 16 prints V_c(s), but V_c(s') is meant.
         mask = self.cost_mask(batch)[:, None]
         cost_target = losses.td_target(batch.costs[:, None], self.gammas, net.cost_value(s_next), mask)
         if config.recorded_step:
@@ -216,9 +215,8 @@ class C2IQL(ConstrainedAgent):
         cost_critic_loss = losses.td_loss(cost_target, net.cost_critics(s, a))
 
         # Lines 19-20: policy extraction.
-        weight = losses.expectile_weight(q - v, config.kappa_2)
-        if self.conditioned and config.policy_thresholds == "own":
-            weight = weight * own_thresholds(limit, batch.costs_to_go)
+        counts = policy_weight(config, limit, batch.costs_to_go)
+        weight = counts * losses.expectile_weight(q - v, config.kappa_2)
         policy_loss = losses.policy_loss(weight, gaussian_log_prob(a, *net.policy(s)))
 
         of_networks = {"value": value_loss, "cost_value": cost_value_loss, "critic": critic_loss}

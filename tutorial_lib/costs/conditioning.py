@@ -112,11 +112,14 @@ def draw_thresholds(
     return torch.where(kind < config.infinite_share, torch.inf, finite)
 
 
-def own_thresholds(threshold: Tensor, costs_to_go: Tensor) -> Tensor:
-    """Returns weights (B,) with a mean of 1, which are zero except for a transition's own thresholds.
+def policy_weight(config: Config, threshold: Tensor, costs_to_go: Tensor) -> Tensor | float:
+    """Returns the weights of transitions in the policy's loss, (B,), with a mean of 1, or 1 for all.
 
-    A threshold (B,) is the transition's own if it is what its episode still costs (B,), or infinite.
+    With `policy_thresholds='own'`, they are zero except for a transition's own thresholds. A threshold (B,)
+    is the transition's own if it is what its episode still costs (B,), or infinite.
     """
+    if not isinstance(config, ConditioningConfig) or config.policy_thresholds == "all":
+        return 1.0
     own = ((threshold == costs_to_go) | threshold.isinf()).float()
     return own / own.mean().clamp(min=1e-6)
 

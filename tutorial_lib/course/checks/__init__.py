@@ -16,6 +16,7 @@ from tutorial_lib.course.checks.discounting import *
 from tutorial_lib.course.checks.failures import *
 from tutorial_lib.course.checks.from_scratch import *
 from tutorial_lib.course.checks.iql import *
+from tutorial_lib.course.checks.keeping import *
 from tutorial_lib.course.checks.penalty import *
 from tutorial_lib.course.checks.reconstruction import *
 from tutorial_lib.course.checks.recordings import *

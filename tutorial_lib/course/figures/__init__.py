@@ -10,6 +10,7 @@ from tutorial_lib.course.figures.discounting import *
 from tutorial_lib.course.figures.episodes import *
 from tutorial_lib.course.figures.failures import *
 from tutorial_lib.course.figures.from_scratch import *
+from tutorial_lib.course.figures.keeping import *
 from tutorial_lib.course.figures.luck import *
 from tutorial_lib.course.figures.maximisation_bias import *
 from tutorial_lib.course.figures.method_map import *
@@ -19,5 +20,6 @@ from tutorial_lib.course.figures.recordings import *
 from tutorial_lib.course.figures.results import *
 from tutorial_lib.course.figures.safety import *
 from tutorial_lib.course.figures.shortcut import *
+from tutorial_lib.course.figures.whole import *
 from tutorial_lib.studies.figures import *
 from tutorial_lib.style import *
