@@ -215,8 +215,7 @@ class C2IQL(ConstrainedAgent):
         cost_critic_loss = losses.td_loss(cost_target, net.cost_critics(s, a))
 
         # Lines 19-20: policy extraction.
-        counts = policy_weight(config, limit, batch.costs_to_go)
-        weight = counts * losses.expectile_weight(q - v, config.kappa_2)
+        weight = losses.expectile_weight(q - v, config.kappa_2) * policy_weight(config, batch)
         policy_loss = losses.policy_loss(weight, gaussian_log_prob(a, *net.policy(s)))
 
         of_networks = {"value": value_loss, "cost_value": cost_value_loss, "critic": critic_loss}

@@ -6,7 +6,7 @@ Limits, budgets and costs are in unsafe steps per episode.
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
@@ -112,15 +112,15 @@ def draw_thresholds(
     return torch.where(kind < config.infinite_share, torch.inf, finite)
 
 
-def policy_weight(config: Config, threshold: Tensor, costs_to_go: Tensor) -> Tensor | float:
+def policy_weight(config: Config, batch: Any) -> Tensor | float:
     """Returns the weights of transitions in the policy's loss, (B,), with a mean of 1, or 1 for all.
 
-    With `policy_thresholds='own'`, they are zero except for a transition's own thresholds. A threshold (B,)
-    is the transition's own if it is what its episode still costs (B,), or infinite.
+    With `policy_thresholds='own'`, they are zero except for a transition's own thresholds. A `limit` (B,) of
+    the batch is the transition's own if it is equal to its `costs_to_go` (B,), or infinite.
     """
     if not isinstance(config, ConditioningConfig) or config.policy_thresholds == "all":
         return 1.0
-    own = ((threshold == costs_to_go) | threshold.isinf()).float()
+    own = ((batch.limit == batch.costs_to_go) | batch.limit.isinf()).float()
     return own / own.mean().clamp(min=1e-6)
 
 
