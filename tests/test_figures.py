@@ -231,24 +231,6 @@ def test_learning_curves_hide_the_panels_that_are_left():
     assert [ax.get_visible() for ax in figure.axes] == [True] * 4 + [False] * 2
 
 
-def test_scores_draw_every_episode_and_the_limits_at_their_height():
-    figure = figures.scores(results())
-    reward, cost = figure.axes
-    dots = [line for line in cost.lines if line.get_marker() == "o"]
-    assert sum(len(line.get_xdata()) for line in dots) == 12
-    assert sorted({y for line in dots for y in line.get_ydata()}) == pytest.approx([25, 45, 65])
-    dashed = [line for line in cost.lines if line.get_linestyle() == "--"]
-    assert [set(line.get_ydata()) for line in dashed] == [{30}, {50}, {70}]
-    assert not [line for line in reward.lines if line.get_linestyle() == "--"]
-
-
-def test_predicted_against_paid_has_a_panel_per_limit():
-    figure = figures.predicted_against_paid(results())
-    for ax, limit in zip(figure.axes, LIMITS, strict=True):
-        assert labelled(ax, "episode").get_xydata() == pytest.approx(np.tile([limit - 3, limit - 5], (4, 1)))
-        assert set(labelled(ax, "limit").get_ydata()) == {limit}
-
-
 def test_cost_return_plane_has_a_dot_per_episode_and_a_line_per_threshold():
     task = get_task("BallCircle")
     zeros = np.zeros((6, 8), np.float32)
