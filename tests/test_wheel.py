@@ -75,7 +75,7 @@ main()
 
 
 def test_the_installed_package_looks_for_data_in_the_home_and_trains(installed, tmp_path):
-    options = f"--data {ROOT}/data/BallRun.hdf5 --updates 2 --crm-steps 2 --out run".split()
+    options = ["--data", f"{ROOT}/data/BallRun.hdf5", *"--updates 2 --crm-steps 2 --out run".split()]
     used = run(installed, tmp_path, "-c", USE, "BallRun", *options)
     assert used.returncode == 0, used.stderr
     message, *_ = used.stdout.splitlines()
