@@ -13,6 +13,7 @@ from tutorial_lib.checkpoints import load_agent
 from tutorial_lib.course.figures import film
 from tutorial_lib.data import SHIPPED_DATA
 from tutorial_lib.studies.paper import TABLE1
+from tutorial_lib.studies.report import markdown, pair
 from tutorial_lib.studies.results import SCORES, load_results, over_seeds
 
 AGENT = SHIPPED_DATA / "agents" / "BallCircle.safetensors"
@@ -63,18 +64,6 @@ def results() -> str:
     for task in found.loc["C2IQL"].index:
         row = {"task": task}
         for name, title in (("C2IQL", "C2IQL"), ("BC-Safe", "cloning of safe episodes")):
-            row[title] = _pair(*found.loc[(name, task), list(SCORES)])
-        rows.append(row | {"the paper's C2IQL, on other data": _pair(*TABLE1["C2IQL"][task])})
-    return _markdown(pd.DataFrame(rows))
-
-
-def _pair(reward: float, cost: float) -> str:
-    """Returns 'return / cost', in italics where the mean cost is above the limit."""
-    text = f"{reward:.2f} / {cost:.2f}"
-    return f"*{text}*" if cost > 1 else text
-
-
-def _markdown(table: pd.DataFrame) -> str:
-    """Returns a table in Markdown."""
-    lines = [table.columns, ["---"] * len(table.columns), *table.to_numpy()]
-    return "\n".join("| " + " | ".join(map(str, line)) + " |" for line in lines)
+            row[title] = pair(*found.loc[(name, task), list(SCORES)])
+        rows.append(row | {"the paper's C2IQL, on other data": pair(*TABLE1["C2IQL"][task])})
+    return markdown(pd.DataFrame(rows))

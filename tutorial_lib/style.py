@@ -139,5 +139,6 @@ def legend_below(figure, *axes):
     entries = {
         label: handle for ax in axes for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)
     }
-    columns = len(entries) if len(entries) <= 5 else -(-len(entries) // 2)
+    rows = max(1, -(-len(entries) // 5))  # at most five entries stand in a row
+    columns = -(-len(entries) // rows)
     figure.legend(entries.values(), entries.keys(), loc="outside lower center", ncols=columns)

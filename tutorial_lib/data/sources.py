@@ -16,7 +16,7 @@ from tutorial_lib.tasks import TASKS, Task, as_task
 
 DSRL_URL = "https://huggingface.co/datasets/YYY-45/DSRL/resolve/main/"
 MAX_BYTES = 5_000_000_000
-"""A download may have this number of bytes. DSRL's largest files have less than one billion."""
+"""A download may have this number of bytes."""
 MAX_SECONDS = 4 * 3600
 """A download may take this number of seconds."""
 SHIPPED_DATA = data_folder()

@@ -25,6 +25,8 @@ REFERENCES = ("C2IQL", "BC-Frontier", "BC (budget rule)")
 """The algorithms whose results are the bar: the course's own, and two that clone and have no critic."""
 EPISODES = 20
 """The number of episodes for each run and limit. It is fixed, so that nobody can choose it by its result."""
+PAYS_MORE = ", which pays more"
+"""What stands behind the name of a reference that was measured at a higher cost only."""
 NAME = "agent.safetensors"
 """The name of an agent's file in a folder."""
 
@@ -92,7 +94,7 @@ def bar_at(reference: pd.DataFrame, cost: float, limit: float) -> tuple[float, s
     if not name and len(reference):
         cheapest = reference.loc[reference["cost"].idxmin()]
         if cheapest["cost"] <= limit:
-            best, name = float(cheapest["reward_score"]), f"{cheapest['algorithm']}, which pays more"
+            best, name = float(cheapest["reward_score"]), f"{cheapest['algorithm']}{PAYS_MORE}"
     return best, name
 
 
@@ -171,6 +173,8 @@ def _advice(row: dict[str, Any]) -> str:
     if row["cost"] < 0.5 and not row["reached"]:
         return " Look at the told limit: less than half of the limit is used."
     if row["reward"] < row["bar"]:
+        if row["bar_of"].endswith(PAYS_MORE):  # nothing was measured at this cost
+            return " Look at the told limit: no reference was measured at so low a cost."
         return " Look at the policy extraction: at this cost more reward is possible."
     return ""
 

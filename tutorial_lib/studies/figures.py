@@ -195,12 +195,7 @@ def per_limit(results):
         axes[2 * block + 1, 0].set_ylabel("cost paid")
     for ax in axes[2 * (blocks - 1) :].T[len(tasks) - columns * (blocks - 1) :].flat:
         ax.set_visible(False)
-    handles = {
-        label: handle
-        for ax in axes.flat
-        for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)
-    }
-    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=min(5, len(handles)))
+    legend_below(figure, *axes.flat)
     return described(figure, _per_limit_text(tasks, list(looks)))
 
 

@@ -82,8 +82,8 @@ def results_table(results: pd.DataFrame | None = None) -> str:
             row[f"{limit} limit: reward / cost"] = " / ".join(
                 f"{line[name]:.2f} [{line[f'{name}_low']:.2f}, {line[f'{name}_high']:.2f}]" for name in SCORES
             )
-        row["mean: reward / cost"] = _pair(*over_seeds(part).loc[0, list(SCORES)])
-        row["the paper's, on DSRL's data"] = _pair(*TABLE1["C2IQL"][task])
+        row["mean: reward / cost"] = pair(*over_seeds(part).loc[0, list(SCORES)])
+        row["the paper's, on DSRL's data"] = pair(*TABLE1["C2IQL"][task])
         rows.append(row)
     return markdown(pd.DataFrame(rows))
 
@@ -109,17 +109,17 @@ def baselines_table() -> str:
         row = {"": name, "seeds": found.loc[name, "seeds"].min()}
         for task in tasks:
             key = (name, task)
-            row[task] = _pair(*found.loc[key, list(SCORES)]) if key in found.index else "not run"
+            row[task] = pair(*found.loc[key, list(SCORES)]) if key in found.index else "not run"
         rows.append(row)
     if missing:
         rows.append({"": ", ".join(missing), "seeds": "-"} | dict.fromkeys(tasks, "not run"))
     for name in ("C2IQL", *(name for name in run if name in TABLE1 and name != "C2IQL")):
         row = {"": f"the paper's {name}, on DSRL's data", "seeds": 5}
-        rows.append(row | {task: _pair(*TABLE1[name][task]) for task in tasks})
+        rows.append(row | {task: pair(*TABLE1[name][task]) for task in tasks})
     return markdown(pd.DataFrame(rows))
 
 
-def _pair(reward: float, cost: float) -> str:
+def pair(reward: float, cost: float) -> str:
     """Returns `reward / cost` with two decimals, in italics where the rounded cost exceeds 1."""
     text = f"{round(reward, 2) + 0:.2f} / {cost:.2f}"  # + 0 turns -0.0 into 0.0
     return f"*{text}*" if round(cost, 2) > 1 else text
@@ -144,7 +144,7 @@ def study_table(results: pd.DataFrame) -> pd.DataFrame:
         limits = with_scores(part).groupby("threshold")[list(SCORES)].mean()
         for limit, scores in limits.iterrows():
             word = get_task(row["task"]).cost_limit_names.get(limit)
-            row[f"{word} limit" if word else f"limit {limit:g}"] = _pair(*scores)
+            row[f"{word} limit" if word else f"limit {limit:g}"] = pair(*scores)
         mean = over_seeds(part, ("task",)).iloc[0]
         for score, word in zip(SCORES, ("reward", "cost"), strict=True):
             spread = "" if row["seeds"] == 1 else f" ± {mean[f'{score}_std']:.2f}"

@@ -67,8 +67,8 @@ _RUN: dict[str, Any] = {"prices": (0.2, 1.5), "allowance_share": 1.0, "allowance
 _LONG: dict[str, Any] = {"width": 128, "target_kl": 0.02, "return_bins": 1}
 
 RECIPES: dict[str, Recipe] = {
-    # In a run of 1,000,000 steps the best return at a cost of at most 50 was 693, and in one of 3,000,000 it
-    # was 886. DSRL's data have 900.
+    # In source priced-0 the best return at a cost of at most 50 was 693 with 1,000,000 steps, and 886 with
+    # 3,000,000. DSRL's data have 900.
     "BallRun": Recipe(episodes=940, steps=3_000_000, **_RUN),
     "CarRun": Recipe(episodes=651, steps=800_000, **_RUN),
     "BallCircle": Recipe(episodes=886, steps=2_000_000),
