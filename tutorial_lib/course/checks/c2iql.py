@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterable, Mapping
 import numpy as np
 from scipy import stats
 
-from tutorial_lib.course.checks.checker import text, try_answer
+from tutorial_lib.course.checks.checker import given, name_of, text, try_answer
 
 READINGS = {
     12: ("V_r(s)", {"Q_r target", "Q_c target"}),
@@ -150,17 +150,11 @@ def check_largest_chance(answer: Callable) -> None:
     `answer(exceeded, episodes)` returns the largest chance of exceeding a limit with which `exceeded` or
     fewer of the episodes exceed it in at least 2.5% of all cases. Answers within 0.001 count.
     """
-    name = getattr(answer, "__name__", "the answer")
+    name = name_of(answer)
     for exceeded, episodes in ((0, 50), (0, 10), (2, 10), (25, 50), (10, 10)):
         call = f"{name}({exceeded}, {episodes})"
-        try:
-            found = answer(exceeded, episodes)
-            if found is None:
-                print(f"NOT YET  {name} returns nothing: write it in place of the `...`")
-                return
-            found = float(np.squeeze(found))
-        except Exception as error:  # the reader's code can raise any error
-            print(f"NOT YET  {call} raised {type(error).__name__}: {error}")
+        found = given(answer, (exceeded, episodes), call, lambda got: float(np.squeeze(got)))
+        if found is None:
             return
         right = stats.binomtest(exceeded, episodes).proportion_ci(0.95, "exact")
         if not abs(found - right.high) <= 1e-3:

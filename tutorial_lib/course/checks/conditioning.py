@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from tutorial_lib.costs.conditioning import rescaled_budget
-from tutorial_lib.course.checks.checker import text, try_answer
+from tutorial_lib.course.checks.checker import given, name_of, text, try_answer
 from tutorial_lib.course.tabular import budget_optimum, random_cmdp
 
 
@@ -55,20 +55,15 @@ def check_encoding(answer: Callable) -> None:
 
     Every number of order one for infinity is right if it is above the codes of all finite thresholds.
     """
-    name = getattr(answer, "__name__", "the answer")
+    name = name_of(answer)
     for cost_range, thresholds in ((80.0, (0, 30, 50, 70, 80)), (200.0, (0, 40, 100, 160, 200))):
         codes = []
         for threshold in (*thresholds, np.inf):
             call = f"{name}({threshold:g}, {cost_range:g})"
-            try:
-                code = answer(threshold, cost_range)
-                if code is None:
-                    print(f"NOT YET  {name} returns nothing: write it in place of the `...`")
-                    return
-                codes.append(float(code))
-            except Exception as error:  # the reader's code can raise any error
-                print(f"NOT YET  {call} raised {type(error).__name__}: {error}")
+            code = given(answer, (threshold, cost_range), call, float)
+            if code is None:
                 return
+            codes.append(code)
             if not abs(codes[-1]) <= 5:
                 print(
                     f"NOT YET  {call} = {codes[-1]:.4g}: a network's input should be finite and of order one"
@@ -173,14 +168,12 @@ def check_five_losses(answer: Callable) -> None:
     a dictionary. A loss of m heads may be their sum or their mean.
     """
     x, gammas = five_losses_batch(), (0.9, 0.95, 0.97)
-    try:
-        found = answer(x, 0.7, 0.9, 0.99, torch.tensor(gammas, dtype=torch.float64))
-        if found is None:
-            print(f"NOT YET  {answer.__name__} returns nothing: write it in place of the `...`")
-            return
-        found = [np.asarray(part, float) for part in (found.values() if isinstance(found, dict) else found)]
-    except Exception as error:  # the reader's code can raise any error
-        print(f"NOT YET  {answer.__name__} raised {type(error).__name__}: {error}")
+
+    def read(got) -> list[np.ndarray]:
+        return [np.asarray(part, float) for part in (got.values() if isinstance(got, dict) else got)]
+
+    found = given(answer, (x, 0.7, 0.9, 0.99, torch.tensor(gammas, dtype=torch.float64)), read=read)
+    if found is None:
         return
     if len(found) != 5 or any(part.ndim for part in found):
         shapes = ", ".join(str(part.shape) for part in found)

@@ -1,48 +1,17 @@
 """This module checks the answers to the exercises of notebooks 13 and 14."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 import pandas as pd
 from scipy import stats
 
-from tutorial_lib.course.checks.checker import text, try_answer
+from tutorial_lib.course.checks.checker import try_answer
 
 Case = tuple[tuple, object, str]
 """The arguments of a call, its right value, and a hint for values that no known mistake gives."""
 Mistake = tuple[Callable, str]
 """A function that makes a mistake, and the words that name it."""
-
-
-def _try_answer(answer: Callable, cases: Sequence[Case], mistakes: Sequence[Mistake]) -> None:
-    """Prints the first mistake of `answer`, or OK. A value that a known mistake gives is told by its name.
-
-    Unlike `try_answer`, it takes NaN for a right value where NaN is expected.
-    """
-    name = getattr(answer, "__name__", "the answer")
-    for arguments, expected, hint in cases:
-        call = f"{name}({', '.join(text(argument) for argument in arguments)})"
-        try:
-            got = answer(*arguments)
-        except Exception as error:  # the reader's code can raise any error
-            print(f"NOT YET  {call} raised {type(error).__name__}: {error}")
-            return
-        if got is None:
-            print(f"NOT YET  {name} returns nothing: write it in place of the `...`")
-            return
-        if not _equal(got, expected):
-            known = [words for wrong, words in mistakes if _equal(got, wrong(*arguments), 1e-4)]
-            print(f"NOT YET  {call} = {text(got)}, expected {text(expected)}: {(known or [hint])[0]}")
-            return
-    print(f"OK  {name} is right in {len(cases)} cases")
-
-
-def _equal(got, expected, tolerance: float = 1e-6) -> bool:
-    try:
-        close = np.allclose(got, expected, atol=tolerance, equal_nan=True)
-        return bool(np.shape(got) == np.shape(expected) and close)
-    except (TypeError, ValueError):  # `got` has no number, or another shape
-        return False
 
 
 def check_paired_interval(answer: Callable) -> None:
@@ -82,7 +51,7 @@ def check_paired_interval(answer: Callable) -> None:
         pair = np.array(first), np.array(second)
         expected = np.array(stats.ttest_rel(*pair).confidence_interval(0.95))
         cases.append((pair, expected, "return the pair (mean - half, mean + half) of the differences"))
-    _try_answer(answer, cases, mistakes)
+    try_answer(answer, cases, mistakes)
 
 
 def check_at_equal_cost(answer: Callable) -> None:
@@ -116,7 +85,7 @@ def check_at_equal_cost(answer: Callable) -> None:
     ]
     for cost in (50.0, 5.0):
         cases.append(((cost, 0.9, up, np.array([0.4, 0.6, 0.7])), np.nan, mistakes[0][1]))
-    _try_answer(answer, cases, mistakes)
+    try_answer(answer, cases, mistakes)
 
 
 def check_hidden_by_the_mean(differences) -> None:
@@ -249,7 +218,7 @@ def check_iqm(answer: Callable) -> None:
     ):
         array = np.array(scores)
         cases.append(((array,), float(middle(array)), hint))
-    _try_answer(answer, cases, mistakes)
+    try_answer(answer, cases, mistakes)
 
 
 def check_undominated(answer: Callable) -> None:
@@ -293,4 +262,4 @@ def check_undominated(answer: Callable) -> None:
         ([1.0, 0.8, 0.3], [2.0, 0.9, 0.0], [True, True, True], "more return for more cost is another choice"),
     ):
         cases.append(((np.array(earned), np.array(paid)), np.array(expected), hint))
-    _try_answer(answer, cases, mistakes)
+    try_answer(answer, cases, mistakes)
