@@ -127,8 +127,8 @@ def test_only_shipped_files_are_verified_and_only_once(places, dataset, monkeypa
     sources.write_checksums()
     for path in (dsrl / CAR_RUN.dsrl_file, shipped / "BallRun.hdf5"):  # the last has no line
         write_dataset(path, dataset, path.stem if path.stem in TASKS else "CarRun")
-    hashed, sha256 = [], sources._sha256
-    monkeypatch.setattr(sources, "_sha256", lambda file: hashed.append(file) or sha256(file))
+    hashed, sha256 = [], sources.sha256_of
+    monkeypatch.setattr(sources, "sha256_of", lambda file: hashed.append(file) or sha256(file))
     for task, source in [("CarRun", "dsrl"), ("BallRun", "shipped"), *[("CarRun", "shipped")] * 2]:
         sources.load_dataset(task, source)
     assert hashed == [shipped / "CarRun.hdf5"]

@@ -32,6 +32,12 @@ def _machine() -> str:
     return hashlib.sha256(name.encode()).hexdigest()[:8]
 
 
+def sha256_of(file: Path) -> str:
+    """Returns the SHA-256 of a file's bytes, in hexadecimal. Raises OSError where it cannot be read."""
+    with open(file, "rb") as content:
+        return hashlib.file_digest(content, "sha256").hexdigest()
+
+
 def _temporary(path: Path) -> Path:
     """Returns the name of a new temporary file beside `path`. It is unique, also among several machines."""
     return path.with_name(f".{path.name}.{_machine()}{os.getpid():08x}{uuid.uuid4().hex[:16]}.tmp")

@@ -13,7 +13,6 @@ This module imports `tutorial_lib.data.ppo` and with it stable-baselines3, which
 where it is needed.
 """
 
-import hashlib
 import json
 from dataclasses import asdict
 from importlib.metadata import version
@@ -30,7 +29,7 @@ from tutorial_lib.data.dataset import KEYS, Dataset, DatasetError
 from tutorial_lib.data.hdf5 import read_dataset, write_dataset
 from tutorial_lib.data.ppo import episode_files, run_ppo
 from tutorial_lib.data.thinning import thin
-from tutorial_lib.files import check_output
+from tutorial_lib.files import check_output, sha256_of
 from tutorial_lib.tasks import Task, simulator_of
 from tutorial_lib.tasks.recipes import Recipe
 
@@ -165,7 +164,7 @@ def _collected(path: Path, task: Task) -> _Collected:
     except (KeyError, AttributeError, TypeError, ValueError) as error:
         reason = f"does not say which episodes are from which source ({error})"
         raise DatasetError(f"{path}: {reason}: name a file that `c2iql collect` wrote") from error
-    return _Collected(parts, of_episodes, *counts, hashlib.sha256(path.read_bytes()).hexdigest())
+    return _Collected(parts, of_episodes, *counts, sha256_of(path))
 
 
 # A run of AntCircle is 3 GB. The files are therefore read one at a time, and twice: first for the table of

@@ -16,7 +16,7 @@ from typing import IO
 
 from tutorial_lib.data.dataset import DatasetError
 from tutorial_lib.data.places import VARIABLE, data_folder, in_clone
-from tutorial_lib.files import written_whole
+from tutorial_lib.files import sha256_of, written_whole
 
 RELEASE_URL = ""
 """The address of the folder that has this version's archive. It is empty until there is a release."""
@@ -40,9 +40,7 @@ def write_archive(data: Path | str, folder: Path | str) -> Path:
         for name in files:
             if _is_ours(name):  # an entry has no time, so that equal files give an equal archive
                 archive.writestr(zipfile.ZipInfo(name), (data / name).read_bytes())
-    with open(path, "rb") as content:
-        digest = hashlib.file_digest(content, "sha256").hexdigest()
-    print(f"{path}: {path.stat().st_size:,} bytes, SHA-256 {digest}")
+    print(f"{path}: {path.stat().st_size:,} bytes, SHA-256 {sha256_of(path)}")
     return path
 
 

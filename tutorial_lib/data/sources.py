@@ -2,7 +2,6 @@
 
 import contextlib
 import functools
-import hashlib
 import os
 import shutil
 import time
@@ -11,7 +10,7 @@ from pathlib import Path
 from tutorial_lib.data.dataset import Dataset, DatasetError
 from tutorial_lib.data.hdf5 import read_dataset
 from tutorial_lib.data.places import data_folder, in_clone, why_missing
-from tutorial_lib.files import written_whole
+from tutorial_lib.files import sha256_of, written_whole
 from tutorial_lib.tasks import TASKS, Task, as_task
 
 DSRL_URL = "https://huggingface.co/datasets/YYY-45/DSRL/resolve/main/"
@@ -48,7 +47,7 @@ def _verify_shipped(path: Path, changed: int, checksums: str) -> None:
     """
     lines = (line.partition("  ") for line in checksums.splitlines())
     wanted = {name: digest for digest, _, name in lines}.get(path.name)
-    if wanted and (digest := _sha256(path)) != wanted:
+    if wanted and (digest := sha256_of(path)) != wanted:
         remedy = "restore it from git, or call sources.write_checksums() if you replaced it yourself"
         raise DatasetError(
             f"{path}: file: damaged: SHA-256 is {digest}, but {CHECKSUMS} has {wanted}: {remedy}"
@@ -64,14 +63,8 @@ def write_checksums() -> Path:
     path = SHIPPED_DATA / CHECKSUMS
     files = sorted(SHIPPED_DATA.glob("*.hdf5"))
     with written_whole(path) as temporary:
-        temporary.write_text("".join(f"{_sha256(file)}  {file.name}\n" for file in files))
+        temporary.write_text("".join(f"{sha256_of(file)}  {file.name}\n" for file in files))
     return path
-
-
-def _sha256(file: Path) -> str:
-    """The SHA-256 of a file's bytes, in hexadecimal."""
-    with open(file, "rb") as content:
-        return hashlib.file_digest(content, "sha256").hexdigest()
 
 
 def find_dataset(task: Task | str, source: Path | str = "shipped") -> Path:
@@ -157,7 +150,7 @@ def fetch_dataset(task: Task | str, directory: Path | str | None = None, base_ur
 
 def _verify(file: Path, memory: Path, task: Task) -> str:
     """The SHA-256 of a file. Raises DatasetError where it is not the stored one or the data are unusable."""
-    digest = _sha256(file)
+    digest = sha256_of(file)
     remembered = _remembered(memory) or digest
     if digest != remembered:
         remedy = f"delete it to fetch it again, or delete {memory.name} to accept it"

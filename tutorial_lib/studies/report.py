@@ -5,7 +5,6 @@ All tables are computed from files. A page has a pair of comments for each table
 date.
 """
 
-import hashlib
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +16,7 @@ from tutorial_lib.costs.conditioning import threshold_set
 from tutorial_lib.data.places import ROOT
 from tutorial_lib.data.recordings import best_left
 from tutorial_lib.data.sources import SHIPPED_DATA, load_dataset, shipped_tasks
-from tutorial_lib.files import check_output, written_whole
+from tutorial_lib.files import check_output, sha256_of, written_whole
 from tutorial_lib.scores import with_scores
 from tutorial_lib.studies.figures import cost_return_plane, expected_costs, study_figure
 from tutorial_lib.studies.grids import STUDIES, get_study, varied_options
@@ -51,7 +50,7 @@ def datasheet() -> str:
                 "cost": f"{costs.min():.0f} to {costs.max():.0f}, mean {costs.mean():.0f}",
                 "return": f"{returns.min().round() + 0:.0f} to {returns.max():.0f}",
                 "made with": f"`{data.attributes['made_by']}`, {minutes} min",
-                "SHA-256": f"`{hashlib.sha256(path.read_bytes()).hexdigest()}`",
+                "SHA-256": f"`{sha256_of(path)}`",
             }
         )
     return markdown(pd.DataFrame(rows))
