@@ -11,6 +11,7 @@ from tutorial_lib.checkpoints import save_agent
 from tutorial_lib.data import sources
 from tutorial_lib.data.dataset import Dataset
 from tutorial_lib.data.hdf5 import write_dataset
+from tutorial_lib.files import sha256_of
 from tutorial_lib.playing import evaluate
 from tutorial_lib.scores import save_results
 from tutorial_lib.tasks import TASKS
@@ -41,7 +42,7 @@ def make_samples(folder: Path) -> Path:
     data = make_dataset()
     write_dataset(folder / "data.hdf5", data, TASK)
     write_dataset(folder / "shipped" / "BallRun.hdf5", data, TASK)
-    digest = sources._sha256(folder / "shipped" / "BallRun.hdf5")
+    digest = sha256_of(folder / "shipped" / "BallRun.hdf5")
     (folder / "shipped" / sources.CHECKSUMS).write_text(f"{digest}  BallRun.hdf5\n")
     kind = get_algorithm("C2IQL")
     sizes = {"hidden_width": 8, "hidden_layers": 1, "batch_size": 8, "crm_width": 8, "crm_layers": 1}
