@@ -146,8 +146,9 @@ class OurUpdates:
     def _mark_laps(self) -> None:
         """Make an update call `_lap` around the model, before the gradients and after them."""
         if isinstance(self.agent, C2IQL) and self.agent.reconstructs:
-            self.agent.reconstruction.register_forward_pre_hook(lambda *_: self._lap("networks"))
-            self.agent.reconstruction.register_forward_hook(lambda *_: self._lap("reconstruction"))
+            model = self.agent._borrowers["reconstruction"].module
+            model.register_forward_pre_hook(lambda *_: self._lap("networks"))
+            model.register_forward_hook(lambda *_: self._lap("reconstruction"))
         adam = self.agent.adam
         adam.register_step_pre_hook(lambda *_: self._lap("backward"))
         clear = adam.zero_grad  # it is called between the losses and their gradients, and has no hook

@@ -32,7 +32,7 @@ def random_data(seed, rows=200):
         "next_observations": rng.normal(size=(rows, OBS)),
         "terminals": rng.random(rows) < 0.3,
         "timeouts": rng.random(rows) < 0.3,
-        "timesteps": rng.integers(0, 40, rows),
+        "timesteps": rng.integers(0, 10, rows),
         "returns_to_go": rng.normal(20, 9, size=rows),
         "costs_to_go": rng.integers(0, 9, rows),
     }

@@ -108,30 +108,32 @@ class Slow:
                 x.append(t / T)
         return x
 
-    def cost(self, heads):
-        """What is compared with the limit: a whole episode's cost, from one critic's heads."""
+    def cost(self, heads, t=0):
+        """What is compared with the limit: an episode's cost from step t on, from one critic's heads."""
         config = self.agent.config
         if self.name in ("C2IQL", "C2IQL w/o CC"):
             if config.time_limits == "rate":
                 heads = [q * (1 - g**T) for q, g in zip(heads, TASK.gammas, strict=True)]
-            return self.agent.reconstruction(torch.tensor([heads])).item()
+            return self.agent.networks(self.run).reconstruction(torch.tensor([heads])).item()
         # Q_c <= L~ (eq. 2), where L~ is the discounted sum of a cost of L / T in each of T steps.
-        return heads[0] / (sum(config.gamma**t for t in range(T)) / T)
+        steps = T - t if getattr(config, "clock", False) else T
+        return heads[0] / (sum(config.gamma**t for t in range(steps)) / steps)
 
     def cost_of(self, x, s, a, s_next):
         """The heads that line 17 asks for, those that V_c learns, and the episode's cost that counts."""
         config = self.agent.config
         critics = [k[0] for k in self.call("target", "cost_critics", s, a)]
-        cost, q_cost = max((self.cost(heads), heads) for heads in critics)
+        t = int(x.timesteps)
+        cost, q_cost = max((self.cost(heads, t), heads) for heads in critics)
         if config.evaluated_critic == "mean":
             q_cost = [sum(heads) / len(critics) for heads in zip(*critics, strict=True)]
         stops = x.terminals or (config.time_limits == "mask" and x.timeouts)
         after = self.call("online", "cost_value", s_next)[0]
         gammas = TASK.gammas if len(after) > 1 else [config.gamma]
         backup = [x.costs + (0 if stops else g * c) for g, c in zip(gammas, after, strict=True)]
-        return backup, q_cost, max(cost, self.cost(backup)) if config.recorded_step else cost
+        return backup, q_cost, max(cost, self.cost(backup, t)) if config.recorded_step else cost
 
-    def penalised(self, q, cost, s, limit):
+    def penalised(self, q, cost, state_cost, limit):
         """Eq. 11, or a price per unit of cost beyond the limit."""
         config = self.agent.config
         if config.unsafe_price is None:
@@ -140,7 +142,6 @@ class Slow:
         if config.price_unit == "advantage":
             unit = self.variable("exchange_rate")
         price = config.unsafe_price * unit
-        state_cost = self.cost(self.call("online", "cost_value", s)[0])
         return q - price * (max(cost - limit, 0) - max(state_cost - limit, 0))
 
     def log_prob(self, s, a):
@@ -179,11 +180,11 @@ class Slow:
             v = self.call("online", "value", s)[0]
             if self.name != "IQL":
                 backup, q_cost, cost = self.cost_of(x, s, a, s_next)
-                state_cost = self.cost(self.call("online", "cost_value", s)[0])
+                state_cost = self.cost(self.call("online", "cost_value", s)[0], int(x.timesteps))
                 keeps = cost <= limit and state_cost <= limit
                 if math.isinf(limit) if self.name in CONDITIONED else keeps:
                     self.untouched.append((q - self.call("online", "value", s)[0], cost - state_cost))
-                q = self.penalised(q, cost, s, limit)
+                q = self.penalised(q, cost, state_cost, limit)
                 add("safe_fraction", cost <= limit)
             u = q - v
 
@@ -289,9 +290,30 @@ def test_the_reconstruction_is_trained_in_float32():
     first, second = (make_agent("C2IQL", precision=precision) for precision in ("float32", "bfloat16"))
     for agent in (first, second):
         agent.prepare([toy_dataset()], progress=False)
-    states = (agent.reconstruction.state_dict() for agent in (first, second))
-    for one, other in zip(*(state.values() for state in states), strict=True):
-        assert torch.equal(one, other)
+    for kind in ("parameters", "buffers"):
+        one, other = (getattr(agent, kind)["reconstruction"] for agent in (first, second))
+        assert one and all(torch.equal(one[name], other[name]) for name in one)
+
+
+def test_every_seed_has_a_reconstruction_model_of_its_own():
+    """Alone and beside others, a run has the same one. Runs that differ in their limit share it."""
+    data, seeds = toy_dataset(), (3, 5)
+    together = make_agent("C2IQL", seeds=seeds)
+    alone = [make_agent("C2IQL", seeds=(seed,)) for seed in seeds]
+    limits = make_agent("C2IQL w/o CC", seeds=(5, 5), limit=(10.0, 20.0))
+    for agent in (together, *alone, limits):
+        agent.prepare([data] * len(agent.seeds), progress=False)
+    for kind in ("parameters", "buffers"):
+        both, same = (getattr(agent, kind)["reconstruction"] for agent in (together, limits))
+        for name, of_runs in both.items():
+            for run, agent in enumerate(alone):
+                assert torch.equal(of_runs[run], getattr(agent, kind)["reconstruction"][name][0])
+            assert torch.equal(same[name], of_runs[1].expand_as(same[name]))
+    weights = together.parameters["reconstruction"]["net.0.weight"]
+    assert not torch.equal(weights[0], weights[1])
+    before = weights.clone()
+    one_update(together, random_batch(together))
+    assert torch.equal(weights, before)
 
 
 def test_values_start_at_the_data_or_at_zero():
@@ -462,11 +484,9 @@ def test_a_policy_of_own_thresholds_learns_nothing_from_other_rows():
         assert all(torch.equal(states[0][key], states[1][key]) for key in policy) == same
 
 
-def test_evaluators_need_a_clock_and_the_rule_needs_evaluators():
+def test_evaluators_need_a_clock():
     with pytest.raises(ValueError, match="need clock=True"):
         make_agent("C2IQL", evaluators=1)
-    with pytest.raises(ValueError, match="needs evaluators: set evaluators=1"):
-        make_agent("C2IQL", tell="predicted")
 
 
 def test_controls_tell_one_limit_throughout_or_switch_between_two():
@@ -494,35 +514,42 @@ def test_controls_tell_one_limit_throughout_or_switch_between_two():
             assert player.told.tolist() == second
 
 
-def told_by_hand(agent, observation, left, t):
-    """The largest limit whose predicted rest of the episode fits what is left, tried one by one."""
-    slow, fitting = Slow(agent), [0.0]
-    for limit in [n / 40 * TASK.cost_range for n in range(41)]:
-        s = slow.inputs(observation, limit, t)
-        action = slow.call("online", "policy", s)[0]
+def played_by_hand(agent, observation, limit, t):
+    """The action that is played, its predicted cost, and whether it is the policy's mean."""
+    slow, noise = Slow(agent), torch.randn(6, 2, generator=torch.Generator().manual_seed(0))
+    s = slow.inputs(observation, limit, t)
+    mean, log_std = slow.call("online", "policy", s)
+    found = []
+    for row in [[0.0, 0.0], *noise.tolist()]:
+        action = [m + z * math.exp(d) for m, z, d in zip(mean, row, log_std, strict=True)]
+        action = [min(max(x, -1.0), 1.0) for x in action]
         shares = [k[0] for k in slow.call("online", "evaluators", s, action)]
-        if max(shares) * (T - t) * TASK.max_step_cost <= left:
-            fitting.append(limit)
-    return fitting[-1]
+        found.append((max(shares) * (T - t) * TASK.max_step_cost, action))
+    cost, action = min(found)
+    if 20 * limit <= TASK.cost_range and found[0][0] > limit and cost <= 0.8 * found[0][0]:
+        return action, cost, action is found[0][1]
+    return found[0][1], found[0][0], True
 
 
-def test_the_largest_limit_is_told_whose_predicted_cost_fits_what_is_left():
-    options = {"clock": True, "time_limits": "mask", "evaluators": 2, "tell": "predicted"}
-    agent = make_agent("C2IQL", **options)
+def test_an_agent_brakes_when_nothing_is_left_and_braking_helps():
+    agent = make_agent("C2IQL", clock=True, time_limits="mask", evaluators=2, candidates=6)
     randomise(agent, 3)
-    observations = np.random.default_rng(0).normal(size=(30, TASK.obs_dim)).astype(np.float32)
-    limits = np.linspace(0, 1.2 * T * TASK.max_step_cost, 30)
-    player = agent.player(limits, range(30))
-    costs = np.ones(30)
-    for t in range(3):
-        actions, told = player.act(observations), player.told
-        expected = [
-            told_by_hand(agent, *pair, t) for pair in zip(observations, limits - t * costs, strict=True)
-        ]
-        np.testing.assert_allclose(told, expected)
-        assert actions == pytest.approx(agent.act(observations, told, 0, t))
-        player.see(np.zeros(30), costs)
-    assert told[0] == 0 and told[-1] == TASK.cost_range and len(set(told)) > 3
+    observations = np.random.default_rng(0).normal(size=(40, TASK.obs_dim)).astype(np.float32)
+    limits = np.resize([0.0, 0.3, 2.0, math.inf], 40)  # the cost range is 8: the first two are nearly zero
+    means = {}
+    for t in (0, 3):
+        actions = agent.act(observations, limits, 0, t)
+        costs = agent.predicted_cost(observations, limits, 0, t)
+        for row, (observation, limit) in enumerate(zip(observations, limits, strict=True)):
+            action, cost, is_mean = played_by_hand(agent, observation, limit, t)
+            assert actions[row] == pytest.approx(action, abs=1e-5)
+            assert costs[row] == pytest.approx(cost, rel=1e-4)
+            means.setdefault(limit, set()).add(is_mean)
+    assert means == {0.0: {True, False}, 0.3: {True, False}, 2.0: {True}, math.inf: {True}}
+    large = np.full(40, 2.0)
+    without = agent.playing_with(candidates=0)
+    assert np.array_equal(without.act(observations, large), agent.act(observations, large))
+    assert not np.allclose(without.act(observations, limits), agent.act(observations, limits))
 
 
 @pytest.mark.parametrize("name", CONDITIONED)
@@ -619,7 +646,7 @@ def test_a_linear_reconstruction_is_linear():
     for crm in ("linear", "mlp"):
         agent = make_agent("C2IQL", crm=crm)
         agent.prepare([toy_dataset()], progress=False)
-        model = agent.reconstruction
+        model = agent.networks().reconstruction
         bends[crm] = (model(x) + model(y) - 2 * model((x + y) / 2)).abs().max().item()
     assert bends["linear"] < 1e-3 < 1e-2 < bends["mlp"]
 
@@ -754,11 +781,6 @@ class Transitions:
         return SimpleNamespace(q=q, v=v, q_cost=q_cost, v_cost=v_cost, cost=cost, penalised=penalised)
 
 
-class KnownReconstruction(torch.nn.Module):
-    def forward(self, discounted):
-        return discounted @ torch.tensor(WEIGHTS, dtype=torch.float32)
-
-
 def tables(agent):
     """The agent's networks at every state and every (s, a), as arrays."""
     s, pairs, net = torch.eye(STATES), torch.eye(PAIRS), agent.networks(0)
@@ -789,9 +811,11 @@ def test_the_critics_converge_to_the_solution_of_the_tabular_problem(limit):
     agent, batch = None, data.batch(limit)
     for rate in (2e-2, 2e-3):
         changes = {"gamma": GAMMA, "kappa_1": KAPPA, "hidden_layers": 0, "normalise_observations": False}
-        changes |= {"value_lr": rate, "critic_lr": rate, "target_tau": 0.1}
+        changes |= {"value_lr": rate, "critic_lr": rate, "target_tau": 0.1, "crm": "linear"}
         last, agent = agent, make_agent("C2IQL w/o CC", task=TABULAR, limit=limit, **changes)
-        agent.reconstruction = KnownReconstruction()
+        model = agent.parameters["reconstruction"]  # in units of a horizon
+        model["net.weight"].copy_(torch.tensor(WEIGHTS) / TABULAR.horizon)
+        model["net.bias"].zero_()
         if last:
             agent.load_state({k: v for k, v in last.state().items() if not k.startswith("adam.")})
         for _ in range(700):

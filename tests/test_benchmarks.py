@@ -65,8 +65,11 @@ def same_networks(eager, agent):
                         )
                     layer.weight.data.copy_(weight)
                     layer.bias.data.copy_(bias)
-    eager.crm.load_state_dict(agent.reconstruction.net.state_dict())
-    eager.crm_mean, eager.crm_whiten = agent.reconstruction.mean, agent.reconstruction.whiten
+    model = agent.networks().reconstruction
+    eager.crm.load_state_dict(
+        {key.removeprefix("net."): x[0] for key, x in agent.parameters["reconstruction"].items()}
+    )
+    eager.crm_mean, eager.crm_whiten = model.mean, model.whiten
     eager.mean, eager.std = (agent.variables[f"observation_{name}"][0] for name in ("mean", "std"))
 
 
@@ -79,7 +82,7 @@ def test_updates_are_those_of_a_plain_version(critics, reward_limits):
     config = C2IQL.configure("paper", **options)
     agent, eager = C2IQL(task, config), EagerC2IQL(task, config)
     generator = torch.Generator().manual_seed(0)
-    agent.reconstruction.whiten.copy_(0.1 * torch.randn(3, 3, generator=generator))
+    agent.buffers["reconstruction"]["whiten"].copy_(0.1 * torch.randn(3, 3, generator=generator))
     agent.variables["observation_mean"].fill_(0.5)
     same_networks(eager, agent)
     data = random_transitions(task, 500)
@@ -136,7 +139,8 @@ def test_time_is_charged_to_the_part_that_took_it(monkeypatch):
 
     agent = watch.agent
     agent.draw = taking("sampling", agent.draw)  # once a run
-    agent.reconstruction.net.forward = taking("reconstruction", agent.reconstruction.net.forward)
+    model = agent._borrowers["reconstruction"].module.net
+    model.forward = taking("reconstruction", model.forward)
     agent.network_input = taking("networks", agent.network_input)  # at s and at s'
     weight = agent.parameters["value"]["net.0.weight"]
     weight.register_hook(taking("backward", lambda gradient: None))  # once, when its gradient is known
@@ -155,8 +159,6 @@ def test_every_algorithm_is_timed_as_it_trains():
         found = watch.measure(0)
         assert agent.updates == 2 and found["seconds"] == pytest.approx(sum(found[part] for part in PARTS))
         same = kind(agent.task, agent.config, agent.seeds, agent.limits)
-        if hasattr(agent, "reconstruction"):
-            same.reconstruction = agent.reconstruction
         generators = [torch.Generator().manual_seed(seed) for seed in agent.seeds]
         with products():
             for _ in range(2):
@@ -487,8 +489,8 @@ def test_the_same_actions_are_played_in_every_way():
     actions = policy_actions(agent)
     assert actions.shape == (100, 10, 2)
     first = make_env("BallRun").reset(seed=3)[0]
-    told = np.full(1, agent.task.thresholds[0])
-    assert actions[0, 3] == pytest.approx(agent.act(first[None], told)[0])  # episode 3, step 0
+    player = agent.player(agent.task.thresholds[:1], [3])
+    assert actions[0, 3] == pytest.approx(player.act(first[None])[0])  # episode 3, step 0
     assert (
         play_rollouts(agent, 1)
         == play("ours", "BallRun", actions)

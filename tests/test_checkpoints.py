@@ -77,7 +77,7 @@ def test_no_file_stays_mapped_after_a_resume(dataset, tmp_path):
 
 
 def test_without_reconstruction_none_is_saved():
-    assert not [name for name in make_agent("C2IQL w/o CR").state() if name.startswith("reconstruction")]
+    assert not [name for name in make_agent("C2IQL w/o CR").state() if "reconstruction" in name]
 
 
 def test_a_file_of_another_number_of_runs_is_refused():
@@ -151,10 +151,10 @@ DAMAGE = {
     "another number of seeds": lambda source, path: rewritten(source, path, {"seeds": "[0, 1, 2]"}),
     "no network": lambda source, path: rewritten(source, path, drop="online.policy"),
     "no variable": lambda source, path: rewritten(source, path, drop="variable.reward_scale"),
-    "no reconstruction": lambda source, path: rewritten(source, path, drop="reconstruction."),
+    "no reconstruction": lambda source, path: rewritten(source, path, drop="buffer.reconstruction."),
     "narrow network": lambda source, path: rewritten(source, path, cut="online.policy.net.0.weight"),
     "narrow variable": lambda source, path: rewritten(source, path, cut="variable.observation_mean"),
-    "narrow reconstruction": lambda source, path: rewritten(source, path, cut="reconstruction.net"),
+    "narrow reconstruction": lambda source, path: rewritten(source, path, cut="online.reconstruction.net"),
     "an option is missing": lambda source, path: rewritten(source, path, {"config": '{"profile": "paper"}'}),
     "an unknown entry": lambda source, path: rewritten(source, path, {"colour": "red"}),
     "an unknown tensor": lambda source, path: rewritten(source, path, colour=lambda x: torch.zeros(2)),
@@ -174,7 +174,7 @@ DAMAGE = {
 }
 NOT_FINITE = {
     f"{value} in {name}": (name, value)
-    for name in ("online.policy.net.0.weight", "variable.observation_std", "reconstruction.whiten")
+    for name in ("online.policy.net.0.weight", "variable.observation_std", "buffer.reconstruction.whiten")
     for value in (float("nan"), float("inf"), float("-inf"))
 }
 ABSURD = {

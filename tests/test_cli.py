@@ -268,9 +268,11 @@ def test_defaults_are_the_profiles_and_the_tasks(name, task):
         assert args.config == kind.configure(profile, TASKS[task])
 
 
-def test_a_task_has_values_of_its_own_in_profile_small_which_the_command_line_can_change():
+def test_a_task_can_have_values_of_its_own_in_profile_small(monkeypatch):
+    own = {"AntRun": {"unsafe_price": 20.0}, "AntCircle": {"unsafe_price": 200.0, "crm_noise_rate": 0.05}}
+    monkeypatch.setattr(C2IQL.Config, "tasks", own)
     price = lambda *arguments: parsed(*arguments)[1].config.unsafe_price  # noqa: E731
-    assert [price("AntRun"), price("BallRun"), price("CIQL", "AntRun")] == [20, 6, 6]
+    assert [price("AntRun"), price("BallRun"), price("CIQL", "AntRun")] == [20, 3, 3]
     assert price("AntRun", "--profile", "small") == price("AntRun", "--profile=small") == 20
     assert price("AntRun", "--profile", "paper") is price("AntRun", "--profile=paper") is None
     assert price("AntRun", "--unsafe-price", "None") is None
@@ -280,6 +282,7 @@ def test_a_task_has_values_of_its_own_in_profile_small_which_the_command_line_ca
     )
 
 
+@pytest.mark.xfail(strict=True, reason="the shipped agents are of the recipe before, until the data change")
 @pytest.mark.parametrize(
     "path", sorted((SHIPPED_DATA / "agents").glob("*.safetensors")), ids=lambda p: p.stem
 )
@@ -454,7 +457,7 @@ def small_study(monkeypatch):
     """A study of the shipped data that takes a second."""
     from tutorial_lib.studies import grids
 
-    grid = grids.Grid(("BallRun",), options=({"kappa_1": 0.6},), seeds=1, limits=(25.0,))
+    grid = grids.Grid(("BallRun",), options=({"kappa_1": 0.6},), seeds=1, limits=lambda task: (25.0,))
     monkeypatch.setitem(grids.STUDIES, "quick", grids.Study("How quick?", (grid,)))
 
 

@@ -185,6 +185,14 @@ def test_where_all_thresholds_were_trained_on_the_budget_itself_is_told():
     assert told(20, 10, 190, thresholds="range") == [math.inf]  # covered
 
 
+def test_a_margin_is_kept_in_reserve_until_nothing_can_break_the_limit():
+    assert told(20, 3, 100, thresholds="range", remaining=True, margin=0.25) == [12]
+    assert told(20, 16, 100, thresholds="range", remaining=True, margin=0.25) == [0]
+    assert told(20, 5, 100, thresholds="range", margin=0.25) == [20]  # 10 for half of the steps
+    assert told(20, 10, 190, thresholds="range", margin=0.25) == [math.inf]  # the limit itself covers all
+    assert told(math.inf, 5, 100, thresholds="range", margin=0.25) == [math.inf]
+
+
 def test_a_threshold_shrinks_by_what_is_paid_and_never_below_zero():
     left = after_step(torch.tensor([3.0, 1.0, 0.0, math.inf]), torch.tensor([1.0, 1.0, 1.0, 1.0]))
     assert left.tolist() == [2, 0, 0, math.inf]

@@ -316,8 +316,6 @@ def test_the_memory_that_is_asked_for_is_counted_without_taking_it(name, monkeyp
     runs = task, kind.configure("small", task), (0, 1), limits
     agent = kind(*runs)
     held = sum(x.numel() for tensors in agent.parameters.values() for x in tensors.values())
-    if reconstruction := getattr(agent, "reconstruction", None):
-        held += sum(x.numel() for x in reconstruction.net.parameters())
 
     def with_free(numbers):
         free = psutil.virtual_memory()._replace(available=4 * COPIES * numbers)
@@ -325,9 +323,7 @@ def test_the_memory_that_is_asked_for_is_counted_without_taking_it(name, monkeyp
         check_memory(kind, *runs)
 
     generator = torch.get_rng_state()
-    with_free(
-        4 * held
-    )  # at most: a network may be built and replaced, and one reconstruction serves all runs
+    with_free(4 * held)  # at most: a network may be built and replaced
     with pytest.raises(
         ValueError, match=f"^{re.escape(kind.name)}: these options need .* GB are free: choose"
     ):

@@ -159,7 +159,7 @@ import sys
 from tutorial_lib.__main__ import main
 from tutorial_lib.studies import grids
 
-grid = grids.Grid(("BallRun",), ("BC-All",), seeds=1, limits=(25.0,))
+grid = grids.Grid(("BallRun",), ("BC-All",), seeds=1, limits=lambda task: (25.0,))
 grids.STUDIES["small"] = grids.Study("Does it talk?", (grid,))
 for words in sys.argv[1].split(";"):
     sys.argv = ["c2iql", *words.split()]

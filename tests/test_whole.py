@@ -83,7 +83,9 @@ def test_the_table_of_readings_is_what_gradients_say():
         terminals=torch.zeros(64), timeouts=torch.zeros(64), timesteps=torch.zeros(64),
         limit=torch.full((64,), 30.0),
     )  # fmt: skip
-    agent.episode_cost = lambda heads: 30 + heads.sum(-1) - heads.sum(-1).mean()  # half exceed the limit
+    agent.episode_cost = lambda net, heads, over: (
+        30 + heads.sum(-1) - heads.sum(-1).mean()
+    )  # half exceed the limit
     net = agent.networks()
     now = agent.network_input(net, batch.observations, batch.limit)
     before, _ = agent.losses(net, batch)

@@ -25,7 +25,7 @@ METRICS = "metrics.csv"
 NEWER_OPTIONS: dict[str, Any] = {
     "thresholds": "set", "infinite_share": 0.15, "zero_share": 0.1, "episode_share": 0.5,
     "clock": False, "price_unit": "return", "evaluated_critic": "highest", "evaluators": 0, "tell": "left",
-    "first_guess": "data", "policy_thresholds": "all",
+    "first_guess": "data", "policy_thresholds": "all", "margin": 0.0, "candidates": 0,
 }  # fmt: skip
 """The options that the shipped agents' files do not name yet, and what these agents were trained with."""
 DAMAGED = (
@@ -108,6 +108,7 @@ def _read(path: Path, device: torch.device | str = "cpu") -> tuple[Agent, dict[s
             _check_sizes(header, {name: file.get_slice(name).get_shape() for name in names})
             # Copies: otherwise the file stays mapped, and Windows cannot replace it.
             tensors = {name: file.get_tensor(name).clone() for name in names}
+            tensors = _one_model_per_run(tensors, len(header.seeds))
         for name, tensor in tensors.items():
             if not tensor.isfinite().all():
                 raise ValueError(f"{name} has values that are NaN or infinite")
@@ -122,6 +123,20 @@ def _read(path: Path, device: torch.device | str = "cpu") -> tuple[Agent, dict[s
                 raise ValueError(f"adam.* has {shapes} for a tensor of shape {own}")
         agent.data_checksum = data
     return agent, tensors
+
+
+def _one_model_per_run(tensors: dict[str, torch.Tensor], runs: int) -> dict[str, torch.Tensor]:
+    """Returns the tensors of a file with a reconstruction model for every run, where it has one for all.
+
+    The shipped agents' files have one.
+    """
+    now = {}
+    for name, value in tensors.items():
+        if name.startswith("reconstruction."):
+            kind = "buffer" if name.endswith((".mean", ".whiten")) else "online"
+            name, value = f"{kind}.{name}", value.expand(runs, *value.shape).clone()
+        now[name] = value
+    return now
 
 
 @contextlib.contextmanager
@@ -176,7 +191,7 @@ def _check_sizes(header: Header, shapes: dict[str, list[int]]) -> None:
         of_runs = name.startswith(("online.", "buffer.", "variable."))
         if of_runs and shape[:1] != [runs]:
             raise ValueError(f"{name} has shape {tuple(shape)} for {runs} seeds")
-        if of_runs or name.startswith("reconstruction."):
+        if of_runs or name.startswith("reconstruction."):  # a shipped agent's
             room += math.prod(shape) // (runs if of_runs else 1)
     # Twice, because an algorithm may replace a network of its base class.
     kind, task, config, seeds, limits, _ = header
@@ -224,7 +239,8 @@ def resume(agent: Agent, generators: list[torch.Generator], run_dir: Path) -> li
         whole = set(saved.state()) | {f"generator.{run}" for run in range(len(generators))}
         if missing := sorted(whole - set(tensors)):
             raise ValueError(f"{missing[0]} is missing")
-        if saved.updates and len(saved.adam.state) < sum(len(of) for of in saved.parameters.values()):
+        trained = [of for name, of in saved.parameters.items() if name not in saved.fixed]
+        if saved.updates and len(saved.adam.state) < sum(map(len, trained)):
             raise ValueError("adam.* is incomplete")
         for run, generator in enumerate(generators):
             generator.set_state(tensors[f"generator.{run}"])

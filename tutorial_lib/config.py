@@ -20,6 +20,7 @@ class Bound(NamedTuple):
 
 
 SHARE = Bound(lambda x: 0 < x < 1, "between 0 and 1")
+RESERVE = Bound(lambda x: 0 <= x < 1, "0 or more, and below 1")
 STEP = Bound(lambda x: 0 < x <= 1, "above 0 and at most 1")
 POSITIVE = Bound(lambda x: x > 0, "above 0")
 NOT_NEGATIVE = Bound(lambda x: x >= 0, "0 or more")

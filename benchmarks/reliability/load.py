@@ -36,7 +36,7 @@ TILES = 8
 def _entries(count: int, data: Path) -> list[Runs]:
     """Entries of a study that train for 30 updates and play ten episodes each."""
     rates = tuple({"policy_lr": rate} for rate in np.geomspace(1e-4, 1e-2, count).round(9).tolist())
-    grid = grids.Grid(("BallRun",), ("BC-All",), rates, seeds=1, limits=(40.0,))
+    grid = grids.Grid(("BallRun",), ("BC-All",), rates, seeds=1, limits=lambda task: (40.0,))
     small = {"hidden_width": 8, "hidden_layers": 1, "batch_size": 8, "updates": 30}
     study = grids.Study("Does nothing get lost?", (grid,))
     return grids.entries(study, change=lambda config: config.changed(**small), data=str(data))

@@ -166,8 +166,8 @@ class Agent(Runs):
         """
         return np.full(len(observations), np.nan)
 
-    def diagnose(self, dataset: Dataset) -> dict[str, float]:
-        """Returns numbers that describe the trained agent on its dataset, by name. Studies ask for them."""
+    def diagnose(self, dataset: Dataset, run: int = 0) -> dict[str, float]:
+        """Returns numbers that describe a trained run on its dataset, by name. Studies ask for them."""
         return {}
 
     def check(self, log: list[dict[str, Any]]) -> None:

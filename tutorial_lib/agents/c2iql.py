@@ -13,8 +13,8 @@ Departures:
 5. In profile `small`, the reconstruction model is trained with more noise (`crm_noise_rate`), because the
    paper's noise is smaller than the critics' error.
 6. Not in the paper, and off unless they are asked for: `clock`, `thresholds='range'`, a price in units of the
-   advantages' spread (`price_unit`), `evaluated_critic='mean'`, `policy_thresholds='own'`, and `evaluators`
-   with `tell='predicted'`.
+   advantages' spread (`price_unit`), `evaluated_critic='mean'`, `policy_thresholds='own'`, a `margin`, and
+   `evaluators`, which predict what is paid and choose among `candidates` when a limit is nearly spent.
 
 The paper leaves points 2 to 4 open. The text of each option says what is known of it.
 
@@ -52,18 +52,14 @@ from tutorial_lib.tasks import Task
 class C2IQLConfig(ConstrainedConfig, ReconstructionConfig, EvaluationConfig):
     """The options of C2IQL: those of CIQL, of the reconstruction model and of constraint conditioning."""
 
-    # The tables of `data/README.md` have the reasons.
-    tasks = {
-        "DroneRun": {"time_limits": "mask"},
-        "AntRun": {"unsafe_price": 20.0},
-        "AntCircle": {"unsafe_price": 200.0, "crm_noise_rate": 0.05},
-        "DroneCircle": {"cost_critics": 1},
-    }
+    profiles = {"small": {"time_limits": "mask"}}  # which the clock needs
 
 
 @dataclass(frozen=True)
 class WithoutCRConfig(ConstrainedConfig, EvaluationConfig):
     """The options of C2IQL without cost reconstruction."""
+
+    profiles = {"small": {"time_limits": "mask"}}
 
 
 @dataclass(frozen=True)
@@ -78,9 +74,10 @@ class C2IQL(ConstrainedAgent):
     Config: ClassVar[type[ConstrainedConfig]] = C2IQLConfig
     config: Any  # a C2IQLConfig; the ablations lack some of its options
     scalars = ConstrainedAgent.scalars | {
+        "evaluators_loss": "squared error of the evaluators, summed over them, in cost ranges",
         "cost_mean": "mean expected cost of an episode, in unsafe steps: what line 9 compares with the limit",
     }
-    at_test: ClassVar[tuple[str, ...]] = ("infinite_at_test", "tell")
+    at_test: ClassVar[tuple[str, ...]] = ("infinite_at_test", "tell", "margin", "candidates")
     conditioned = True
     """True if the limit is an input of every network."""
     reconstructs = True
@@ -91,9 +88,6 @@ class C2IQL(ConstrainedAgent):
         if self.clock and config.time_limits != "mask":
             raise ValueError("clock=True needs time_limits='mask': its limits are on the remaining cost")
         self.gammas = torch.tensor(self.cost_gammas, device=self.device)  # (m,)
-        if self.reconstructs:  # untrained until `prepare` or `load_state`
-            with torch.random.fork_rng(devices=[]):
-                self.reconstruction = CostReconstruction(task, config).to(self.device).requires_grad_(False)
 
     @property
     def cost_gammas(self) -> tuple[float, ...]:
@@ -118,18 +112,27 @@ class C2IQL(ConstrainedAgent):
         if self.evaluates:
             inputs = self.task.obs_dim + self.extra_inputs
             built["evaluators"] = Evaluators(inputs, self.task.act_dim, self.config)
+        if self.reconstructs:  # untrained until `prepare` or `load_state`
+            built["reconstruction"] = CostReconstruction(self.task, self.config)
         return built
+
+    @property
+    def fixed(self) -> tuple[str, ...]:  # type: ignore[override]
+        return ("reconstruction",) if self.reconstructs else ()
 
     @property
     def targets(self) -> tuple[str, ...]:  # type: ignore[override]
         return (*ConstrainedAgent.targets, *(("evaluators",) if self.evaluates else ()))
 
     def prepare(self, datasets: Sequence[Dataset], progress: bool = True) -> None:
-        """Trains the reconstruction model, then does what CIQL does before the first update."""
-        if self.reconstructs:  # all runs share one model, because they learn from the same episodes
-            self.reconstruction = train_reconstruction(
-                self.task, self.config, datasets[0], device=self.device, progress=progress
-            )
+        """Trains the reconstruction model of every seed, then does what CIQL does before the first update."""
+        models: dict[int, CostReconstruction] = {}
+        for run, seed in enumerate(self.seeds if self.reconstructs else ()):
+            if seed not in models:  # runs with other limits learn from the same episodes
+                models[seed] = train_reconstruction(
+                    self.task, self.config, datasets[run], seed, self.device, progress
+                )
+            self.fill_network("reconstruction", run, models[seed])
         super().prepare(datasets, progress)
 
     def draw(self, data: Batch, generator: torch.Generator, limit: float) -> dict[str, Tensor]:
@@ -163,41 +166,42 @@ class C2IQL(ConstrainedAgent):
         s = self.network_input(net, batch.observations, limit, t)
         return s, self.network_input(net, batch.next_observations, left, t + 1)
 
-    def episode_cost(self, q_cost: Tensor) -> Tensor:
-        """Returns the cost of a whole episode, (...,), for discounted costs (..., m) (lines 6 to 8).
+    def episode_cost(self, net: Networks, q_cost: Tensor, timesteps: Tensor | float = 0.0) -> Tensor:
+        """Returns the cost of an episode, (...,), for discounted costs (..., m) (lines 6 to 8).
 
-        It is in unsafe steps per episode.
+        It is in unsafe steps per episode. Of `timesteps`, only eq. 2 needs to know.
         """
         horizon, gammas = self.task.horizon, self.gammas
         if not self.reconstructs:
-            return super().episode_cost(q_cost)  # Q_c / (L~ / L)
+            return super().episode_cost(net, q_cost, timesteps)  # Q_c / (L~ / L)
         if self.config.time_limits == "rate":  # the sum has no end: keep the share of the first T steps
             q_cost = q_cost * (1 - gammas**horizon)
-        return self.reconstruction(q_cost)
+        return net.reconstruction(q_cost)
 
     def untouched(self, cost: Tensor, state_cost: Tensor, limit: Tensor) -> Tensor:
         """Returns true where the limit is infinite, (B,). No V_r there contains a payment."""
         return limit.isinf() if self.conditioned else super().untouched(cost, state_cost, limit)
 
     def losses(self, net: Networks, batch: Fields) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-        config, a, limit = self.config, batch.actions, batch.limit
-        s, s_next = self._inputs(net, batch)
+        config, a, limit, over = self.config, batch.actions, batch.limit, self.clock * batch.timesteps
+        s, s_next = self._inputs(net, batch)  # with a clock, limits are on the cost after `over` steps
 
         # Lines 6-8: cost reconstruction. The critic that predicts the highest cost counts.
         q_cost = net.target_cost_critics(s, a)  # (k, B, m)
-        costs = self.episode_cost(q_cost)  # (k, B)
+        costs = self.episode_cost(net, q_cost, over)  # (k, B)
         cost, q_cost = costs.amax(0), self.evaluated_heads(q_cost, costs)  # (B,) and (B, m)
 
         # Line 18: its target, the cost of the recorded step. Eq. 16 prints V_c(s), but V_c(s') is meant.
         mask = self.cost_mask(batch)[:, None]
         cost_target = losses.td_target(batch.costs[:, None], self.gammas, net.cost_value(s_next), mask)
         if config.recorded_step:
-            cost = torch.maximum(cost, self.episode_cost(cost_target.detach()))
+            cost = torch.maximum(cost, self.episode_cost(net, cost_target.detach(), over))
 
         # Lines 9-10: constraint penalisation.
         q_reward = net.target_critics(s, a).amin(0)
         v_cost = net.cost_value(s)  # (B, m)
-        q = self.penalised_q(net, q_reward, cost, v_cost, limit)
+        state_cost = self.state_cost(net, v_cost, over)
+        q = self.penalised_q(net, q_reward, cost, state_cost, limit)
 
         # Lines 11-12: value function.
         v = net.value(s)
@@ -222,57 +226,55 @@ class C2IQL(ConstrainedAgent):
         of_networks |= {"cost_critic": cost_critic_loss, "policy": policy_loss}
         if self.evaluates:
             of_networks["evaluators"] = evaluation.evaluation_loss(net, batch, s, s_next, self.task)
-        return of_networks, self.logged(cost, limit, v, q_reward, v_cost) | {"cost_mean": cost.mean()}
+        return of_networks, self.logged(cost, limit, v, q_reward, state_cost) | {"cost_mean": cost.mean()}
 
     def player(self, limits: Sequence[float] | np.ndarray, seeds: Sequence[int], run: int = 0) -> Player:
         return BudgetPlayer(self, limits, run) if self.conditioned else super().player(limits, seeds, run)
 
     def act(self, observations: np.ndarray, limits: np.ndarray, run: int = 0, t: int = 0) -> np.ndarray:
-        """Returns the mean actions (E, act) at observations (E, obs) of step t under limits (E,)."""
-        with torch.no_grad():
-            net, x = self.networks(run), (self._tensor(observations), self._tensor(limits))
-            return net.policy(self.network_input(net, *x, t))[0].cpu().numpy()
+        """Returns actions (E, act) at observations (E, obs) of step t under limits (E,).
+
+        They are the policy's means, unless it brakes harder (`candidates`).
+        """
+        return self._choose(observations, limits, run, t)[0].cpu().numpy()
 
     def predicted_cost(
         self, observations: np.ndarray, limits: np.ndarray, run: int = 0, t: int = 0
     ) -> np.ndarray:
-        """Returns the cost of an episode, (E,), that the highest cost critic predicts for the mean action.
+        """Returns the cost of the rest of an episode, (E,), that is predicted for the actions of `act`.
 
-        It is in unsafe steps. With evaluators, they predict it, and not the cost critics. The observations of
-        step t are (E, obs) and the limits are (E,).
+        It is in unsafe steps: the highest of the evaluators', or of the cost critics' where there are no
+        evaluators. The observations of step t are (E, obs) and the limits are (E,).
         """
-        with torch.no_grad():
-            net, x = self.networks(run), (self._tensor(observations), self._tensor(limits))
-            s = self.network_input(net, *x, t)
-            action, _ = net.policy(s)
-            if self.evaluates:
-                costs = net.evaluators(s, action) * evaluation.most_cost(self.task, t)
-            else:
-                costs = self.episode_cost(net.cost_critics(s, action))
-            return costs.amax(0).cpu().numpy()
+        return self._choose(observations, limits, run, t)[1].cpu().numpy()
 
-    def largest_limit(self, observations: np.ndarray, left: np.ndarray, run: int, t: int) -> np.ndarray:
-        """Returns the largest limit, (E,), whose predicted cost is at most `left` (E,), or zero if none is.
+    @torch.no_grad()
+    def _choose(
+        self, observations: np.ndarray, limits: np.ndarray, run: int, t: int
+    ) -> tuple[Tensor, Tensor]:
+        """Returns the actions (E, act) that are played, and the cost (E,) that is predicted for each."""
+        net, limit = self.networks(run), self._tensor(limits)
+        s = self.network_input(net, self._tensor(observations), limit, t)
+        mean, log_std = net.policy(s)
+        if not self.evaluates:
+            over = t if self.clock else 0.0
+            return mean, self.episode_cost(net, net.cost_critics(s, mean), over).amax(0)
+        count = self.config.candidates if evaluation.is_nearly_zero(limit, self.task).any() else 0
+        actions = evaluation.proposals(mean, log_std, count)  # (E, n, act)
+        episodes, n, _ = actions.shape
+        shares = net.evaluators(s.repeat_interleave(n, 0), actions.flatten(0, 1)).amax(0)
+        costs = shares.view(episodes, n) * evaluation.most_cost(self.task, t)
+        played = evaluation.braking(costs, limit, self.task)[:, None]  # (E, 1)
+        return actions.take_along_dim(played[..., None], 1).squeeze(1), costs.take_along_dim(
+            played, 1
+        ).squeeze(1)
 
-        The observations of step t are (E, obs).
-        """
-        choices = evaluation.limits_to_tell(self.task)
-        pairs = np.repeat(observations, len(choices), 0), np.tile(choices, len(observations))
-        costs = self.predicted_cost(*pairs, run, t).reshape(len(observations), len(choices))
-        return evaluation.largest_that_fits(choices, costs, left)
-
-    def diagnose(self, dataset: Dataset) -> dict[str, float]:
-        """Returns the error of the reconstruction model, in unsafe steps per episode."""
+    def diagnose(self, dataset: Dataset, run: int = 0) -> dict[str, float]:
+        """Returns the error of a run's reconstruction model, in unsafe steps per episode."""
         if not self.reconstructs:
             return {}
-        error = reconstruction_error(self.reconstruction, self.task, self.config, dataset)
-        return {"reconstruction_error": error}
-
-    def state(self) -> dict[str, Tensor]:
-        if not self.reconstructs:
-            return super().state()
-        model = {f"reconstruction.{key}": value for key, value in self.reconstruction.state_dict().items()}
-        return super().state() | model
+        model = self.networks(run).reconstruction
+        return {"reconstruction_error": reconstruction_error(model, self.task, self.config, dataset)}
 
 
 class C2IQLWithoutCR(C2IQL):
@@ -290,6 +292,7 @@ class C2IQLWithoutCC(C2IQL):
     name = "C2IQL w/o CC"
     in_table1 = False
     Config = WithoutCCConfig
+    scalars = {name: words for name, words in C2IQL.scalars.items() if name != "evaluators_loss"}
     needs_limit = True
     at_test = ()
     conditioned = False

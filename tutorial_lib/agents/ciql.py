@@ -40,17 +40,18 @@ class CIQL(ConstrainedAgent):
 
         # The cost of an action: the highest of the cost critics, and at least the recorded step (eq. 16).
         q_cost = net.target_cost_critics(s, a)  # (k, B, 1)
-        costs = self.episode_cost(q_cost)  # (k, B)
+        costs = self.episode_cost(net, q_cost)  # (k, B)
         cost, q_cost = costs.amax(0), self.evaluated_heads(q_cost, costs)  # (B,) and (B, 1)
         mask = self.cost_mask(batch)[:, None]
         cost_target = losses.td_target(batch.costs[:, None], config.gamma, net.cost_value(s_next), mask)
         if config.recorded_step:
-            cost = torch.maximum(cost, self.episode_cost(cost_target.detach()))
+            cost = torch.maximum(cost, self.episode_cost(net, cost_target.detach()))
 
         # Eq. 11: constraint penalisation.
         q_reward = net.target_critics(s, a).amin(0)
         v_cost = net.cost_value(s)  # (B, 1)
-        q = self.penalised_q(net, q_reward, cost, v_cost, limit)
+        state_cost = self.state_cost(net, v_cost)
+        q = self.penalised_q(net, q_reward, cost, state_cost, limit)
 
         # Eq. 12: value function.
         v = net.value(s)
@@ -71,4 +72,4 @@ class CIQL(ConstrainedAgent):
 
         of_networks = {"value": value_loss, "cost_value": cost_value_loss, "critic": critic_loss}
         of_networks |= {"cost_critic": cost_critic_loss, "policy": policy_loss}
-        return of_networks, self.logged(cost, limit, v, q_reward, v_cost)
+        return of_networks, self.logged(cost, limit, v, q_reward, state_cost)

@@ -10,7 +10,6 @@ of this module bootstraps at the action that the policy takes in s', under what 
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -22,8 +21,8 @@ from tutorial_lib.costs.conditioning import ConditioningConfig
 from tutorial_lib.networks import Critics
 from tutorial_lib.tasks import Task
 
-LIMITS_TO_TELL = 41
-"""The number of limits among which `limits_to_tell` lets an agent choose."""
+LESS, NEARLY = 0.2, 0.05
+"""The shares in `braking`: of the predicted cost, and of the task's cost range."""
 
 
 @dataclass(frozen=True)
@@ -33,19 +32,23 @@ class EvaluationConfig(ConditioningConfig):
     evaluators: Annotated[int, NOT_NEGATIVE] = 0
     """The number of critics that learn what the policy that acts will pay. The highest counts. With 0 there
     are none. They need `clock=True`."""
-    tell: Literal["left", "predicted", "throughout", "switch"] = "left"
-    """Which limit the policy is told at each step. With 'left', it is what is left of the limit (eq. 23).
-    With 'predicted', it is the largest finite limit for which the evaluators predict no more cost than is
-    left. The other two are controls. With 'throughout', it is the limit itself at every step, so that nothing
-    counts the cost. With 'switch', it is infinity as long as anything is left, and then zero, so that the
-    network knows of no limit between the two."""
+    candidates: Annotated[int, NOT_NEGATIVE] = 0
+    """The number of actions that the policy proposes, besides its mean, when (nearly) nothing is left of the
+    limit that it is told. If the evaluators predict more cost than is left, and clearly less for one of the
+    proposals, that one is played (see `braking`). With 0, or without evaluators, the mean is always played.
+    """
+    tell: Literal["left", "throughout", "switch"] = "left"
+    """Which limit the policy is told at each step. With 'left', it is what is left of the limit (eq. 23). The
+    other two are controls. With 'throughout', it is the limit itself at every step, so that nothing counts
+    the cost. With 'switch', it is infinity as long as anything is left, and then zero, so that the network
+    knows of no limit between the two."""
+
+    profiles = {"small": {"evaluators": 2, "candidates": 64, "margin": 0.1}}
 
     def __post_init__(self):
         super().__post_init__()
         if self.evaluators and not self.clock:
             raise ValueError("evaluators need clock=True: they predict the remaining cost")
-        if self.tell == "predicted" and not self.evaluators:
-            raise ValueError("tell='predicted' needs evaluators: set evaluators=1")
 
 
 class Evaluators(Critics):
@@ -79,19 +82,31 @@ def evaluation_loss(net: Networks, batch: Fields, s: Tensor, s_next: Tensor, tas
     return ((target - predicted) / task.cost_range).square().mean(-1).sum()
 
 
-def limits_to_tell(task: Task) -> np.ndarray:
-    """Returns the limits that an agent can choose to be told, (n,): from zero to the task's cost range.
+def proposals(mean: Tensor, log_std: Tensor, count: int) -> Tensor:
+    """Returns the actions that a Gaussian policy proposes, (E, 1 + count, act): first its mean (E, act).
 
-    Infinity is not among them. A policy that is told infinity may go where no limit is kept afterwards.
+    The others are spread as the Gaussian is, always by the same random numbers. So an agent's action is a
+    function of the state, the limit and the time. `log_std` is (act,).
     """
-    return np.linspace(0, task.cost_range, LIMITS_TO_TELL)
+    noise = torch.randn(count, mean.shape[-1], generator=torch.Generator().manual_seed(0)).to(mean)
+    others = mean[:, None] + log_std.exp() * noise
+    return torch.cat([mean[:, None], others.clamp(-1, 1)], 1)
 
 
-def largest_that_fits(limits: np.ndarray, costs: np.ndarray, left: np.ndarray) -> np.ndarray:
-    """Returns the largest of `limits` (n,) whose cost (E, n) is at most what is left (E,), or zero, (E,).
+def braking(costs: Tensor, limits: Tensor, task: Task) -> Tensor:
+    """Returns which of n proposed actions is played, (E,), by predicted costs (E, n) and limits (E,).
 
-    `limits` rise.
+    It is the first, the policy's mean, unless the limit is nearly zero (`is_nearly_zero`), the mean's
+    predicted cost exceeds it, and the least predicted cost is lower by at least the share `LESS` of the
+    mean's. A network is smooth: told zero just above a speed limit, it brakes as little as a policy that is
+    just below. The evaluators have learned from all recorded actions what braking harder would save. Where
+    they see little difference it is noise, and the mean is the better choice.
     """
-    fits = costs <= left[:, None]
-    last = len(limits) - 1 - fits[:, ::-1].argmax(1)
-    return np.where(fits.any(1), limits[last], 0.0)
+    mean, least = costs[:, 0], costs.min(1)
+    brakes = is_nearly_zero(limits, task) & (mean > limits) & (least.values <= (1 - LESS) * mean)
+    return torch.where(brakes, least.indices, 0)
+
+
+def is_nearly_zero(limits: Tensor, task: Task) -> Tensor:
+    """Returns true where a limit is at most the share `NEARLY` of the task's cost range, for any shape."""
+    return limits <= NEARLY * task.cost_range

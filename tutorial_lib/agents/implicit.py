@@ -73,7 +73,12 @@ class ConstrainedConfig(ImplicitConfig):
     noisy estimates, the higher one also leaves a margin."""
 
     profiles = {
-        "small": {"kappa_2": 0.97, "unsafe_price": 6.0, "recorded_step": True},
+        "small": {
+            "cost_kappa": 0.9,
+            "evaluated_critic": "mean",
+            "unsafe_price": 3.0,
+            "price_unit": "advantage",
+        },
         "printed": {"time_limits": "bootstrap", "cost_critics": 1, "first_guess": "zero"},
     }
 
@@ -166,13 +171,23 @@ class ConstrainedAgent(ImplicitAgent):
         guesses = [float(dataset.costs.mean()) * horizon / limit - 1 for dataset in datasets]
         self.fill_last_bias(("cost_value", "cost_critics"), guesses)
 
-    def episode_cost(self, q_cost: Tensor) -> Tensor:
-        """Returns the cost of a whole episode, (...,), for discounted costs (..., m).
+    def episode_cost(self, net: Networks, q_cost: Tensor, timesteps: Tensor | float = 0.0) -> Tensor:
+        """Returns the cost of an episode after its first `timesteps` (...), for discounted costs (..., m).
 
-        It is in unsafe steps per episode, like the limit L with which it is compared. By default, it is the
-        only head divided by L~ / L (eq. 2): to compare this with L is to compare Q_c with L~.
+        It is (...,), in unsafe steps per episode, like the limit L with which it is compared. By default, it
+        is the only head divided by L~ / L (eq. 2), where the horizon is what is left of it: to compare this
+        with L is to compare Q_c with L~.
         """
-        return q_cost.squeeze(-1) / average_threshold(1.0, self.config.gamma, self.task.horizon)
+        return q_cost.squeeze(-1) / average_threshold(1.0, self.config.gamma, self.task.horizon - timesteps)
+
+    def state_cost(self, net: Networks, v_cost: Tensor, timesteps: Tensor | float = 0.0) -> Tensor | None:
+        """Returns the cost of an episode from a state on, (B,), for the heads of V_c, (B, m).
+
+        It is None where there is no `unsafe_price`, because eq. 11 does not ask for it.
+        """
+        if self.penalty_is_zero:
+            return None
+        return self.episode_cost(net, v_cost.detach(), timesteps)
 
     def evaluated_heads(self, q_cost: Tensor, costs: Tensor) -> Tensor:
         """Returns the heads that V_c learns, (B, m), from those of k critics, (k, B, m).
@@ -188,13 +203,12 @@ class ConstrainedAgent(ImplicitAgent):
         return goes_on(batch, self.config.time_limits)
 
     def logged(
-        self, cost: Tensor, limit: Tensor, v: Tensor, q_reward: Tensor, v_cost: Tensor
+        self, cost: Tensor, limit: Tensor, v: Tensor, q_reward: Tensor, state_cost: Tensor | None
     ) -> dict[str, Tensor]:
-        """Returns what the log says besides the losses.
-
-        Costs, limits, V_r and Q_r are (B,), and the heads of V_c are (B, m).
-        """
-        spreads = self.spreads(q_reward, v, cost, v_cost, limit) if self.prices_advantages else {}
+        """Returns what the log says besides the losses. All arguments are (B,)."""
+        spreads = {}
+        if self.prices_advantages and state_cost is not None:
+            spreads = self.spreads(q_reward, v, cost, state_cost, limit)
         return spreads | {
             "safe_fraction": (cost <= limit).float().mean(),
             "value_mean": v.mean(),
@@ -202,30 +216,27 @@ class ConstrainedAgent(ImplicitAgent):
         }
 
     def penalised_q(
-        self, net: Networks, q_reward: Tensor, cost: Tensor, value_cost: Tensor, limit: Tensor
+        self, net: Networks, q_reward: Tensor, cost: Tensor, state_cost: Tensor | None, limit: Tensor
     ) -> Tensor:
         """Returns the penalised Q_r, (B,), by eq. 11, or by `losses.priced_q` if there is an `unsafe_price`.
 
-        `q_reward` is in discounted reward. `cost` and `limit` are in unsafe steps per episode. All three are
-        (B,). `value_cost` has the heads of V_c, (B, m), in discounted cost.
+        `q_reward` is in discounted reward. `cost` of the action, `state_cost` (see there) and `limit` are in
+        unsafe steps per episode. All four are (B,).
         """
-        if self.config.unsafe_price is None:
+        if self.config.unsafe_price is None or state_cost is None:
             return losses.penalised_q(q_reward, cost, limit)
         unit = net.reward_scale / self.task.cost_range
         if self.prices_advantages:
             unit = net.exchange_rate
-        state_cost = self.episode_cost(value_cost.detach())
         return losses.priced_q(q_reward, cost, state_cost, limit, self.config.unsafe_price * unit)
 
     def spreads(
-        self, q_reward: Tensor, v: Tensor, cost: Tensor, value_cost: Tensor, limit: Tensor
+        self, q_reward: Tensor, v: Tensor, cost: Tensor, state_cost: Tensor, limit: Tensor
     ) -> dict[str, Tensor]:
         """Returns the standard deviations of both advantages over the actions for which nothing is paid.
 
-        Q_r, V_r, costs and limits are (B,), and the heads of V_c are (B, m). Where there are fewer than two
-        such actions, both are zero.
+        All arguments are (B,). Where there are fewer than two such actions, both are zero.
         """
-        state_cost = self.episode_cost(value_cost)
         untouched = self.untouched(cost, state_cost, limit).float()
         return {
             "reward_spread": losses.spread(q_reward - v, untouched).detach(),

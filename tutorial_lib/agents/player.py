@@ -73,33 +73,15 @@ class BudgetPlayer(CountingPlayer):
     """A player that tells the policy at every step what is left of the limit (eq. 23)."""
 
     @property
-    def left(self) -> np.ndarray:
-        """What is left of the limit at this step, as eq. 23 tells it to the policy, (E,)."""
-        config = self.agent.config
-        remaining = config.time_limits == "mask"  # the critics then predict the remaining cost
-        return told_limit(self.agent.task, config, self.limits, self.spent, self.t, remaining)
-
-    def _choose(self, observations: np.ndarray) -> np.ndarray:
-        """Returns the limits that the policy is told at observations (E, obs), (E,)."""
-        if self.agent.config.tell == "predicted":
-            left = self.limits - self.spent
-            self._predicted = self.agent.largest_limit(observations, left, self.run, self.t)
-        return self.told
-
-    def act(self, observations: np.ndarray) -> np.ndarray:
-        return self.agent.act(observations, self._choose(observations), self.run, self.t)
-
-    @property
     def told(self) -> np.ndarray:
-        """The limit that the policy is told at this step, (E,). With tell='predicted', `act` chooses it."""
+        """The limit that the policy is told at this step, (E,)."""
         task, config = self.agent.task, self.agent.config
-        if config.tell == "predicted":
-            return self._predicted
         if config.tell == "throughout":
             return trained_limit(task, config, self.limits)
         if config.tell == "switch":
             return trained_limit(task, config, np.where(self.spent < self.limits, np.inf, 0.0))
-        return self.left
+        remaining = config.time_limits == "mask"  # the critics then predict the remaining cost
+        return told_limit(task, config, self.limits, self.spent, self.t, remaining)
 
     def predicted_cost(self, observations: np.ndarray) -> np.ndarray:
-        return self.agent.predicted_cost(observations, self._choose(observations), self.run, self.t)
+        return self.agent.predicted_cost(observations, self.told, self.run, self.t)

@@ -57,6 +57,8 @@ class Runs:
     """The networks that have a target network, a copy that follows them with Polyak step `tau`."""
     frozen: ClassVar[tuple[str, ...]] = ()
     """The networks through which a loss needs a gradient although it does not train them."""
+    fixed: ClassVar[tuple[str, ...]] = ()
+    """The networks that no update changes. `Agent.prepare` may train them before the first update."""
     steps_variables: bool
     """True if the algorithm defines `step`."""
 
@@ -95,19 +97,22 @@ class Runs:
             return x.to(self.device)
 
         def trained(x: Tensor) -> Tensor:
-            return x.to(self.device).requires_grad_()
+            return on_device(x).requires_grad_()
 
         self.modules = {name: nets[0] for name, nets in networks.items()}
         self._borrowers = self._make_borrowers()  # refuses layers that cannot be lifted
         stacks = {kind: {n: lift.stacked(nets, kind) for n, nets in networks.items()} for kind in lift.KINDS}
-        self.parameters = lift.map_tensors(stacks["parameters"], trained)
+        self.parameters = {
+            name: lift.map_tensors(stack, on_device if name in self.fixed else trained)
+            for name, stack in stacks["parameters"].items()
+        }
         self.buffers = lift.map_tensors(stacks["buffers"], on_device)
         self.target_parameters = lift.map_tensors(
             {name: self.parameters[name] for name in self.targets}, lambda x: x.detach().clone()
         )
         stack = {name: torch.stack(values) for name, values in variables.items()}
         self.variables = lift.map_tensors(stack, on_device)
-        self.rates = {name: self.optimiser(name) for name in networks}
+        self.rates = {name: self.optimiser(name) for name in networks if name not in self.fixed}
         groups = [
             {
                 "params": list(self.parameters[name].values()),
@@ -162,6 +167,16 @@ class Runs:
                 for name in set(names) & set(parameters):
                     for bias, value in zip(list(parameters[name].values())[-1], values, strict=True):
                         bias.fill_(value)
+
+    def fill_network(self, name: str, run: int, network: nn.Module) -> None:
+        """Gives one run's network the parameters and buffers of a network with the same layers."""
+        with torch.no_grad():
+            for own, given in (
+                (self.parameters, network.named_parameters),
+                (self.buffers, network.named_buffers),
+            ):
+                for key, value in given():
+                    own[name][key][run].copy_(value)
 
     def state(self) -> dict[str, Tensor]:
         """Returns all tensors by flat names: online.*, buffer.*, target.*, variable.*, adam.* and updates."""

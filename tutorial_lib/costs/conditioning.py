@@ -13,7 +13,7 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from tutorial_lib.config import SHARE, Config
+from tutorial_lib.config import RESERVE, SHARE, Config
 from tutorial_lib.tasks import Task
 
 
@@ -56,8 +56,12 @@ class ConditioningConfig(Config):
     it is when the code of infinity (1.5 cost ranges) is the closest to the rescaled budget. With 'never', the
     paper's "closest value" is always finite."""
 
+    margin: Annotated[float, RESERVE] = 0.0
+    """The share of a limit that the budget rule keeps in reserve: it plays for (1 - margin) times the limit.
+    An agent that pays what it is told pays more than that in half of its runs."""
+
     profiles = {
-        "small": {"zero_threshold": True},
+        "small": {"clock": True, "thresholds": "range", "episode_share": 0.7, "policy_thresholds": "own"},
         "printed": {"thresholds_per": "batch", "infinite_at_test": "never"},
     }
 
@@ -103,10 +107,12 @@ def draw_thresholds(
         return choices[torch.randint(len(choices), (draws,), generator=generator)].expand(config.batch_size)
     if batch is None:
         raise ValueError("thresholds='range' needs the batch: it says what each episode still costs")
-    own = batch["costs_to_go"].cpu()
+    own = batch["costs_to_go"]
     if not config.clock:
-        own = own * task.horizon / (task.horizon - batch["timesteps"].cpu())
-    kind, which, place = torch.rand(3, config.batch_size, generator=generator)
+        own = own * task.horizon / (task.horizon - batch["timesteps"])
+    kind, which, place = torch.rand(3, config.batch_size, generator=generator).to(
+        own.device, non_blocking=True
+    )
     finite = torch.where(which < config.episode_share, own, place * task.cost_range)
     finite = torch.where(kind < config.infinite_share + config.zero_share, 0.0, finite)
     return torch.where(kind < config.infinite_share, torch.inf, finite)
@@ -180,7 +186,8 @@ def told_limit(
     are the limits of E episodes, and `spent` (E,) is what each has cost so far. With `remaining`, the critics
     predict the remaining cost and not that of a whole episode, so the budget is not rescaled.
     """
-    budget = limits - spent if remaining else rescaled_budget(limits, spent, t, task.horizon)
+    aims = (1 - config.margin) * limits
+    budget = aims - spent if remaining else rescaled_budget(aims, spent, t, task.horizon)
     if config.thresholds == "set" and config.infinite_at_test == "nearest":
         chosen = nearest_threshold(budget, task, with_infinite=True, with_zero=config.zero_threshold)
     else:

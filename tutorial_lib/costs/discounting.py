@@ -17,11 +17,12 @@ def discounted_sums(costs: np.ndarray, gammas: ArrayLike) -> np.ndarray:
     return costs @ powers.T
 
 
-def average_threshold(limit: Any, gamma: float, horizon: int) -> Any:
+def average_threshold(limit: Any, gamma: float, horizon: Any) -> Any:
     """Returns L~ = (L / T) (1 - gamma^T) / (1 - gamma) (eq. 2), in discounted cost.
 
-    This is the discounted sum of a constant cost of L / T per step. `limit` is a number, an array or a
-    tensor, and the result has its type and shape. Raises ValueError if gamma is not in (0, 1).
+    This is the discounted sum of a constant cost of L / T per step. `limit` and `horizon` are numbers, arrays
+    or tensors, and the result has the shape to which they broadcast. Raises ValueError if gamma is not in
+    (0, 1).
     """
     if not 0 < gamma < 1:
         raise ValueError(f"gamma must lie in (0, 1), not {gamma}")

@@ -8,6 +8,7 @@ import dataclasses
 import fnmatch
 import functools
 import itertools
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +19,10 @@ from tutorial_lib.data.dataset import DatasetError
 from tutorial_lib.data.sources import find_dataset, load_dataset
 from tutorial_lib.studies.paper import TABLE2
 from tutorial_lib.studies.runs import Runs
-from tutorial_lib.tasks import TASKS, get_task
+from tutorial_lib.tasks import TASKS, Task, get_task
+
+TUNING_SEED = 100
+"""The first seed of the runs that options are chosen on. No reported run has such a seed."""
 
 
 @dataclass(frozen=True)
@@ -36,10 +40,13 @@ class Grid:
     """Changes of options that only playing reads. Every agent plays its episodes once with each."""
     seeds: int = 3
     """The number of seeds."""
+    first_seed: int = 0
+    """The first seed. The seeds of reported runs are 0 and up, and those of tuning are `TUNING_SEED` and up.
+    The episodes of an evaluation start in states that belong to the seed of the run."""
     profile: str | None = None
     """The profile of these entries. None: the one that `entries` is asked for."""
-    limits: tuple[float, ...] | None = None
-    """The limits that agents play under. None: the task's thresholds."""
+    limits: Callable[[Task], tuple[float, ...]] | None = None
+    """Returns the limits that agents play under. None: the task's thresholds."""
 
 
 @dataclass(frozen=True)
@@ -52,12 +59,66 @@ class Study:
     """Do the results have the columns of `Agent.diagnose`?"""
 
 
+def unseen(task: Task) -> tuple[float, ...]:
+    """Returns limits between the task's own, and one 20% below the smallest."""
+    small, middle, high = task.thresholds
+    return 0.8 * small, (small + middle) / 2, (middle + high) / 2
+
+
+def throughout(task: Task) -> tuple[float, ...]:
+    """Returns the limits that study `told` tells a policy at every step."""
+    return 0.0, *task.thresholds, math.inf
+
+
 KAPPAS = (0.5, 0.7, 0.9)
 SIZES = ({"crm": "linear"}, {"crm_width": 16, "crm_layers": 1}, {"crm_width": 64}, {"crm_width": 256}) + (
     {"crm_width": 512, "crm_layers": 5},
 )
 TABLE1_ALGORITHMS = tuple(name for name, kind in ALGORITHMS.items() if kind.in_table1)
 ABLATIONS = ("C2IQL", "C2IQL w/o CR", "C2IQL w/o CC", "CIQL")
+WHO_KEEPS: tuple[dict, ...] = (
+    {"tell": "throughout", "margin": 0.0, "candidates": 0},  # the network alone
+    {"tell": "switch", "margin": 0.0, "candidates": 0},  # two policies and the rule
+    {"infinite_at_test": "never", "margin": 0.0, "candidates": 0},  # the network and the rule of eq. 23
+    {"margin": 0.0, "candidates": 0},  # and infinity where the budget covers all steps
+    {"candidates": 0},  # and a margin
+    {},  # and the brake
+)
+_SET: dict = {"thresholds": "set", "policy_thresholds": "all"}
+_NO_CLOCK: dict = _SET | {"clock": False, "time_limits": "rate", "evaluators": 0}
+TAKEN_BACK: tuple[dict, ...] = (
+    {},
+    {"policy_thresholds": "all"},
+    _SET,
+    _NO_CLOCK,
+    {"price_unit": "return", "unsafe_price": 6.0},
+    {"price_unit": "return", "unsafe_price": None},
+    {"cost_critics": 1},
+    {"evaluated_critic": "highest"},
+    {"cost_kappa": None},
+    {"kappa_1": 0.7},
+    {"crm_noise_rate": 0.0},
+    {"normalise_observations": False},
+    {"first_guess": "zero"},
+)
+"""Each takes one departure of the course's recipe back, and what needs it."""
+ADDED: tuple[dict, ...] = (
+    {},
+    {"normalise_observations": True},
+    {"first_guess": "data"},
+    {"crm_noise_rate": 0.01},
+    {"cost_critics": 2},
+    {"thresholds_per": "sample"},
+    {"zero_threshold": True},
+    {"kappa_1": 0.8},
+    {"time_limits": "rate"},
+    {"unsafe_price": 3.0, "price_unit": "advantage"},
+    {"clock": True, "time_limits": "mask"},
+    {"clock": True, "time_limits": "mask", "thresholds": "range"},
+)
+"""Each adds one departure to the algorithm as it is printed."""
+TRIED: tuple[dict, ...] = ({"policy_thresholds": "own"}, {"policy_thresholds": "all"})
+PLAYED = tuple({"candidates": count, "margin": margin} for count in (0, 64) for margin in (0.0, 0.1))
 PAIR = ("BallRun", "CarCircle")  # a short horizon and a long one: the smallest gamma^T is 0.01 and 0.05
 
 STUDIES: dict[str, Study] = {
@@ -92,11 +153,16 @@ STUDIES: dict[str, Study] = {
     "crm-size": Study("How large must the reconstruction model be?", (Grid(options=SIZES),), diagnoses=True),
     "time-limits": Study(
         "What should a time limit mean to the cost critics?",
-        (Grid(PAIR, options=tuple({"time_limits": kind} for kind in ("rate", "bootstrap", "mask"))),),
+        (
+            Grid(
+                PAIR,
+                options=tuple(_NO_CLOCK | {"time_limits": kind} for kind in ("rate", "bootstrap", "mask")),
+            ),
+        ),
     ),
     "thresholds-per": Study(
         "One threshold per sample, or one per batch?",
-        (Grid(PAIR, options=({"thresholds_per": "sample"}, {"thresholds_per": "batch"})),),
+        (Grid(PAIR, options=tuple(_SET | {"thresholds_per": per} for per in ("sample", "batch"))),),
     ),
     "cost-critics": Study(
         "One cost critic, or the one of two that expects the most cost?",
@@ -123,7 +189,30 @@ STUDIES: dict[str, Study] = {
         ),
     ),
     "unseen-limits": Study(
-        "Does the agent keep limits that it was never trained on?", (Grid(limits=(25.0, 40.0, 60.0)),)
+        "Does the agent keep limits that no other study plays under?",
+        (Grid(tuple(TASKS), seeds=5, limits=unseen),),
+    ),
+    "who-keeps": Study(
+        "Who keeps the limit: the network, the budget rule, the margin or the brake?",
+        (
+            Grid(("BallRun", "BallCircle", "CarCircle"), seeds=5, at_test=WHO_KEEPS),
+            Grid(("BallRun", "BallCircle", "CarCircle"), ("BC (budget rule)",), seeds=5),
+        ),
+    ),
+    "departures": Study(
+        "What does each departure from the printed algorithm do, taken back from the recipe or added alone?",
+        (
+            Grid(("BallCircle",), options=TAKEN_BACK),
+            Grid(("BallCircle",), options=ADDED, profile="printed"),
+        ),
+    ),
+    "told": Study(
+        "What is paid when the policy is told one limit at every step, whatever was paid before?",
+        (Grid(tuple(TASKS), seeds=5, at_test=({"tell": "throughout"},), limits=throughout),),
+    ),
+    "tuning": Study(
+        "What was tried before the recipe was frozen, on seeds of its own?",
+        (Grid(tuple(TASKS), options=TRIED, at_test=PLAYED, first_seed=TUNING_SEED),),
     ),
 }
 
@@ -177,9 +266,9 @@ def entries(
                 task=task,
                 algorithm=algorithm,
                 config=change(kind.configure(grid.profile or profile, record, **options)),
-                seeds=tuple(range(grid.seeds)),
+                seeds=tuple(range(grid.first_seed, grid.first_seed + grid.seeds)),
                 trained_for=record.thresholds if kind.needs_limit else None,
-                limits=grid.limits,
+                limits=grid.limits and grid.limits(record),
                 at_test=grid.at_test,
                 label=",".join(f"{name}={value}" for name, value in options.items()),
                 columns=columns,

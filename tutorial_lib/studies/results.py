@@ -123,7 +123,7 @@ def _check_options(rows: list[tuple[int, dict[str, str]]]) -> None:
     for line, row in rows:
         for column in set(row) - {*OWN_COLUMNS, "reconstruction_error"}:
             if text := row[column]:  # an algorithm that does not have the option has no value
-                is_number = NUMBER.fullmatch(text) is not None
+                is_number = NUMBER.fullmatch(text) is not None or text == "inf"  # a limit that is told
                 first, where = kinds.setdefault(column, (is_number, line))
                 if is_number != first:
                     raise ValueError(

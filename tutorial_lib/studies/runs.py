@@ -132,9 +132,15 @@ def play(runs: Runs, agent: Agent, dataset: Dataset) -> pd.DataFrame:
         results = evaluate(player, runs.limits, runs.episodes, seeds=runs.seeds)
         if runs.trained_for:  # an agent that was found may have been trained for more limits
             results = results[results["threshold"].isin(runs.trained_for)]
-        columns = {name: getattr(player.config, name) for name in runs.columns}
-        columns |= player.diagnose(dataset) if runs.diagnoses else {}
-        frames.append(results.assign(**columns))
+        columns = {name: getattr(player.config, name, None) for name in runs.columns}
+        results = results.assign(**columns)
+        if getattr(player.config, "tell", "") == "throughout":
+            results = results.assign(told=results["threshold"])
+        if runs.diagnoses:
+            found = pd.DataFrame([player.diagnose(dataset, run) for run in range(len(player.seeds))])
+            found = found.assign(seed=player.seeds).drop_duplicates("seed")
+            results = results.merge(found, how="left", on="seed")
+        frames.append(results)
     return pd.concat(frames, ignore_index=True)
 
 
