@@ -7,19 +7,20 @@ Departures:
 
 1. The departures of CIQL.
 2. A limit is drawn for every transition (`thresholds_per`), which has a lower variance than one per batch.
-3. In profile `small`, the threshold set also contains zero (`zero_threshold`).
-4. The policy is told an infinite limit as soon as nothing can break the limit any more (`infinite_at_test`),
+3. The policy is told an infinite limit as soon as nothing can break the limit any more (`infinite_at_test`),
    and an infinite limit enters the networks as 1.5 cost ranges.
-5. In profile `small`, the reconstruction model is trained with more noise (`crm_noise_rate`), because the
+4. In profile `small`, the reconstruction model is trained with more noise (`crm_noise_rate`), because the
    paper's noise is smaller than the critics' error.
-6. Not in the paper, and off unless they are asked for: `clock`, `thresholds='range'`, a price in units of the
-   advantages' spread (`price_unit`), `evaluated_critic='mean'`, `policy_thresholds='own'`, a `margin`, and
-   `evaluators`, which predict what is paid and choose among `candidates` when a limit is nearly spent.
+5. In profile `small`, the networks see the time (`clock`). A limit is then one on the remaining cost. It is
+   drawn from a range (`thresholds`), and shrinks by what is paid.
+6. In profile `small`, the policy is extracted only where the limit is what the own episode still costs, or
+   infinite (`policy_thresholds`). V_c learns from the mean of the cost critics (`evaluated_critic`), and the
+   price of cost is in units of the advantages' spread (`price_unit`).
+7. In profile `small`, a tenth of every limit is kept in reserve (`margin`). `evaluators` predict what the
+   policy that acts will pay, and brake when a limit is nearly spent (`candidates`).
 
-The paper leaves points 2 to 4 open. The text of each option says what is known of it.
-
-Measured: `data/results/table1.csv` and `data/results/ablations.csv`; their tables stand in `data/README.md`,
-with the reasons for the options that some tasks have in profile `small`.
+The paper leaves points 2 and 3 open. Measured: studies `table1`, `ablations`, and `tuning`, on which profile
+`small` was chosen (`data/README.md`).
 """
 
 from collections.abc import Sequence

@@ -5,9 +5,10 @@ Sources: Section 3.1 of the C2IQL paper, equations 11 to 18.
 Departures:
 
 1. The departures of IQL.
-2. In profile `small`, the value of an unsafe action is Q_r minus a price of its cost beyond the limit. In eq.
-   11 and in profile `paper` it is zero (`unsafe_price`).
-3. In profile `small`, the cost of a recorded action is at least that of its recorded step (`recorded_step`).
+2. In profile `small`, the value of an unsafe action is Q_r minus a price of its cost beyond the limit, in
+   units of the advantages' spread (`price_unit`). In eq. 11 and in profile `paper` it is zero (`unsafe_price`).
+3. In profile `small`, the cost critics learn the cost of a policy with the expectile of the one that acts
+   (`cost_kappa`), and V_c learns from their mean (`evaluated_critic`).
 4. The cost critics bootstrap through time limits (`time_limits`). The paper does not say what a time limit
    means.
 5. There are two cost critics, and the higher cost counts (`cost_critics`). The paper does not say how many it
