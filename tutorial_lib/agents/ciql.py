@@ -6,7 +6,8 @@ Departures:
 
 1. The departures of IQL.
 2. In profile `small`, the value of an unsafe action is Q_r minus a price of its cost beyond the limit, in
-   units of the advantages' spread (`price_unit`). In eq. 11 and in profile `paper` it is zero (`unsafe_price`).
+   units of the advantages' spread (`price_unit`). In eq. 11 and in profile `paper` it is zero
+   (`unsafe_price`).
 3. In profile `small`, the cost critics learn the cost of a policy with the expectile of the one that acts
    (`cost_kappa`), and V_c learns from their mean (`evaluated_critic`).
 4. The cost critics bootstrap through time limits (`time_limits`). The paper does not say what a time limit
