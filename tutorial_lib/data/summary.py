@@ -1,5 +1,7 @@
 """What a dataset contains, in lines and tables: `c2iql data check` prints them."""
 
+import json
+
 import numpy as np
 import pandas as pd
 
@@ -46,3 +48,12 @@ def limits_table(dataset: Dataset, task: Task) -> pd.DataFrame:
         near = int((returns >= best - (1 - NEAR_BEST) * abs(best)).sum())
         rows.append((limit, f"{len(returns) / dataset.num_episodes:.1%}", round(best, 1), near))
     return pd.DataFrame(rows, columns=["limit", "episodes within", "best return", "within 10% of it"])
+
+
+def sources_of(dataset: Dataset) -> str:
+    """Returns how many episodes of a dataset come from which run, and the steps of all runs together."""
+    counts = json.loads(dataset.attributes.get("episodes_by_source", "{}"))
+    if not counts:
+        return "one run"  # as the first edition's
+    words = ", ".join(f"{count} {source}" for source, count in counts.items())
+    return f"{words}; {int(dataset.attributes['collected_steps']) / 1e6:g} million steps"

@@ -14,8 +14,9 @@ from tutorial_lib.agents import ALGORITHMS
 from tutorial_lib.agents.c2iql import C2IQLConfig
 from tutorial_lib.costs.conditioning import threshold_set
 from tutorial_lib.data.places import ROOT
-from tutorial_lib.data.recordings import best_left
+from tutorial_lib.data.recordings import best_left, near_best
 from tutorial_lib.data.sources import SHIPPED_DATA, load_dataset, shipped_tasks
+from tutorial_lib.data.summary import sources_of
 from tutorial_lib.files import check_output, sha256_of, written_whole
 from tutorial_lib.scores import with_scores
 from tutorial_lib.studies.figures import cost_return_plane, expected_costs, study_figure
@@ -35,12 +36,15 @@ from tutorial_lib.tasks import DSRL_FRONTIER, TASKS, get_task
 
 
 def datasheet() -> str:
-    """Returns one row for each shipped dataset: its size, episodes, ranges, origin and checksum."""
+    """Returns one row for each shipped dataset: its size, episodes, ranges, origin and checksum.
+
+    `near the best` counts, for each limit, the episodes that keep it and earn 90% of the best that does.
+    """
     rows = []
     for name in shipped_tasks():
         path, data = SHIPPED_DATA / f"{name}.hdf5", load_dataset(name)
         costs, returns = data.episode_costs, data.episode_returns
-        minutes = int(data.attributes["wall_seconds"]) // 60
+        near = [str(near_best(data, limit)) for limit in get_task(name).thresholds]
         rows.append(
             {
                 "file": f"`{path.name}`",
@@ -49,7 +53,9 @@ def datasheet() -> str:
                 "transitions": f"{len(data):,}",
                 "cost": f"{costs.min():.0f} to {costs.max():.0f}, mean {costs.mean():.0f}",
                 "return": f"{returns.min().round() + 0:.0f} to {returns.max():.0f}",
-                "made with": f"`{data.attributes['made_by']}`, {minutes} min",
+                "sources": sources_of(data),
+                "near the best": ", ".join(near),
+                "made with": f"`{data.attributes['made_by']}`",
                 "SHA-256": f"`{sha256_of(path)}`",
             }
         )
