@@ -140,7 +140,7 @@ def compare(osrl: Any, name: str, task_name: str, updates: int = 40) -> Iterator
     """Yields each number's largest difference over the updates, as a share of OSRL's largest value."""
     task, kind = get_task(task_name), get_algorithm(name)
     data, limit = load_dataset(task), float(task.thresholds[0])
-    agent: Any = kind(task, kind.configure("small", task, **OPTIONS), (0,), limit)
+    agent: Any = kind(task, kind.configure("small", **OPTIONS), (0,), limit)
     selected = agent.select(data, limit)
     agent.prepare([selected], progress=False)
     model, generator = make_model(osrl, name, agent, limit), torch.Generator().manual_seed(0)

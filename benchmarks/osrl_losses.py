@@ -72,7 +72,7 @@ def compare(task_name: str, updates: int = 200) -> dict[str, float]:
     """Returns each number's largest difference over the updates, as a share of OSRL's largest value."""
     task, kind = get_task(task_name), get_algorithm("COptiDICE")
     options = {"hidden_width": 32, "batch_size": 64, "normalise_observations": False}
-    agent: Any = kind(task, kind.configure("small", task, **options), (0,), LIMIT)
+    agent: Any = kind(task, kind.configure("small", **options), (0,), LIMIT)
     config, data = agent.config, agent.select(load_dataset(task), LIMIT)
     widths = [config.hidden_width] * config.hidden_layers
     sizes = {"a_hidden_sizes": widths, "c_hidden_sizes": widths, "num_nu": 2, "num_chi": 2}

@@ -48,7 +48,6 @@ def page(kind: type[Agent], results: pd.DataFrame) -> str:
         "## Options",
         "`c2iql train` takes each as `--name`. The defaults of both profiles:",
         options_table(kind),
-        tasks_table(kind),
         "## What it logs",
         "`metrics.csv` has a column for each of these, a row for each run every 250 updates:",
         "\n".join(
@@ -70,16 +69,6 @@ def options_table(kind: type[Agent]) -> str:
         if name != "profile"
     ]
     return "\n".join(["| option | paper | small | meaning |", "|---|---|---|---|", *rows])
-
-
-def tasks_table(kind: type[Agent]) -> str:
-    """A table of the options that tasks change in profile `small`, or no text where no task changes one."""
-    rows = [
-        f"| {task} | {', '.join(f'`{name}={value}`' for name, value in changes.items())} |"
-        for task, changes in kind.Config.tasks.items()
-    ]
-    words = "Some tasks have options of their own in profile `small`:\n\n"
-    return words + "\n".join(["| task | options |", "|---|---|", *rows]) if rows else ""
 
 
 def results_table(kind: type[Agent], results: pd.DataFrame) -> str:

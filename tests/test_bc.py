@@ -21,7 +21,7 @@ CHEAP, DEAR = np.array([0.6, -0.2]), np.array([-0.4, 0.7])
 
 def make_agent(name, limits=None, seeds=(0,), **changes):
     kind = get_algorithm(name)
-    return kind(TASK, kind.configure("small", TASK, **OPTIONS | changes), seeds, limits)
+    return kind(TASK, kind.configure("small", **OPTIONS | changes), seeds, limits)
 
 
 def make_dataset(costs=(10, 30, 31, 80), length=100):

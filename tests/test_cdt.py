@@ -31,7 +31,7 @@ def registered(monkeypatch):
 
 def make_agent(seeds=(0,), **changes):
     kind = get_algorithm("CDT")
-    return kind(TASK, kind.configure("small", TASK, **SMALL | changes), seeds)
+    return kind(TASK, kind.configure("small", **SMALL | changes), seeds)
 
 
 def make_dataset(episodes=40):

@@ -98,12 +98,12 @@ def test_every_command_has_help_for_each_of_its_arguments(c2iql):
 
 @pytest.mark.parametrize("name", ALGORITHMS)
 def test_help_of_training_shows_every_option_of_the_algorithm(name, capsys):
-    kind, task = get_algorithm(name), TASKS["BallRun"]
+    kind = get_algorithm(name)
     meaning = options.describe(kind.Config)
     for profile in PROFILES:
         with pytest.raises(SystemExit) as end:
             options.parse_training([slug(name), "BallRun", "--profile", profile, "--help"])
-        shown, default = words(capsys.readouterr().out), kind.configure(profile, task)
+        shown, default = words(capsys.readouterr().out), kind.configure(profile)
         assert end.value.code == 0 and f"usage: c2iql train {slug(name)}" in shown
         for field in dataclasses.fields(default):
             flag, value = f"--{field.name.replace('_', '-')}", getattr(default, field.name)
@@ -173,7 +173,6 @@ def test_it_runs_as_a_module():
             ["train", "BallRun", "--profile=huge"],
             "unknown profile 'huge': the profiles are paper, small, printed",
         ),
-        (["train", "--updates", "5", "AntRun"], "write the task before the options: c2iql train [ALGORITHM]"),
         (["train", "BallRun", "--seeds", "-2"], "--seeds: each must be from 0 to 2^63 - 1"),
         (["train", "BallRun", "--seeds"], "--seeds: give at least one"),
         (["study", "kappas", "--option", "kappa=0.7"], "--option kappa=0.7: write NAME=VALUE with one of"),
@@ -265,21 +264,17 @@ def test_defaults_are_the_profiles_and_the_tasks(name, task):
     for arguments, profile in (([name, task], "small"), ([slug(name), task, "--profile=paper"], "paper")):
         kind, args = parsed(*arguments)
         assert kind is get_algorithm(name) and args.task == task
-        assert args.config == kind.configure(profile, TASKS[task])
+        assert args.config == kind.configure(profile)
 
 
-def test_a_task_can_have_values_of_its_own_in_profile_small(monkeypatch):
-    own = {"AntRun": {"unsafe_price": 20.0}, "AntCircle": {"unsafe_price": 200.0, "crm_noise_rate": 0.05}}
-    monkeypatch.setattr(C2IQL.Config, "tasks", own)
+def test_the_defaults_are_the_profiles_whatever_the_task():
     price = lambda *arguments: parsed(*arguments)[1].config.unsafe_price  # noqa: E731
-    assert [price("AntRun"), price("BallRun"), price("CIQL", "AntRun")] == [20, 3, 3]
-    assert price("AntRun", "--profile", "small") == price("AntRun", "--profile=small") == 20
+    assert [price("AntRun"), price("BallRun"), price("CIQL", "AntRun")] == [3, 3, 3]
+    assert price("AntRun", "--profile", "small") == price("--profile=small", "AntRun") == 3
     assert price("AntRun", "--profile", "paper") is price("AntRun", "--profile=paper") is None
-    assert price("AntRun", "--unsafe-price", "None") is None
+    assert price("AntRun", "--unsafe-price", "None", "--price-unit", "return") is None
     assert price("AntRun", "--profile", "paper", "--unsafe-price", 7) == 7
-    assert parsed("AntCircle", "--updates", 5)[1].config == C2IQL.configure(
-        "small", updates=5, unsafe_price=200.0, crm_noise_rate=0.05
-    )
+    assert parsed("--updates", 5, "AntCircle")[1].config == C2IQL.configure("small", updates=5)
 
 
 @pytest.mark.xfail(strict=True, reason="the shipped agents are of the recipe before, until the data change")
@@ -292,7 +287,7 @@ def test_training_without_options_makes_the_shipped_agents(path, c2iql, monkeypa
     kind, args = parsed(header["task"])
     assert path.stem == header["task"] and kind.name == header["algorithm"]
     assert dataclasses.asdict(args.config) == checkpoints.NEWER_OPTIONS | json.loads(header["config"])
-    assert args.config == kind.configure("small", TASKS[args.task])
+    assert args.config == kind.configure("small")
 
     made = []
     monkeypatch.setattr(training, "train", lambda agent, data, **_: made.append(agent) or sys.exit(0))

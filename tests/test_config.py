@@ -1,4 +1,4 @@
-"""Options: profiles, tasks' own values, and values that mean nothing."""
+"""Options: profiles, and values that mean nothing."""
 
 import dataclasses
 
@@ -6,7 +6,6 @@ import pytest
 
 from tutorial_lib.agents import ALGORITHMS, C2IQL, BCAll
 from tutorial_lib.config import PROFILES
-from tutorial_lib.tasks import TASKS
 
 
 @pytest.mark.parametrize(
@@ -39,23 +38,20 @@ def test_a_value_at_its_bound_is_taken(option, value):
     assert getattr(C2IQL.configure(**{option: value}), option) == value
 
 
-@pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
 @pytest.mark.parametrize("profile", PROFILES)
 @pytest.mark.parametrize("kind", ALGORITHMS.values(), ids=ALGORITHMS)
-def test_changes_come_last_and_leave_all_else(kind, profile, task):
-    config = kind.configure(profile, task)
+def test_changes_come_last_and_leave_all_else(kind, profile):
+    config = kind.configure(profile)
     assert type(config) is kind.Config and config.profile == profile
-    changed = kind.configure(profile, task, updates=7, policy_lr=0.5)
+    changed = kind.configure(profile, updates=7, policy_lr=0.5)
     assert (changed.updates, changed.policy_lr) == (7, 0.5)
     assert dataclasses.replace(changed, updates=config.updates, policy_lr=config.policy_lr) == config
-    if profile == "paper":  # a task has values of its own in profile small only
+    if profile == "paper":
         assert config == kind.Config()
 
 
 def test_the_printed_profile_is_what_the_paper_prints_at_the_sizes_of_small():
-    printed, small, paper = (
-        C2IQL.configure(profile, TASKS["AntCircle"]) for profile in ("printed", "small", "paper")
-    )
+    printed, small, paper = (C2IQL.configure(profile) for profile in ("printed", "small", "paper"))
     sizes = {
         "updates",
         "batch_size",

@@ -313,7 +313,7 @@ def test_the_memory_that_is_asked_for_is_counted_without_taking_it(name, monkeyp
     """The oracle: all numbers of the agents that are built, and not only outlined."""
     kind, task = get_algorithm(name), TASKS["BallRun"]
     limits = (30.0, 50.0) if kind.needs_limit else None
-    runs = task, kind.configure("small", task), (0, 1), limits
+    runs = task, kind.configure("small"), (0, 1), limits
     agent = kind(*runs)
     held = sum(x.numel() for tensors in agent.parameters.values() for x in tensors.values())
 

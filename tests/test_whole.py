@@ -71,7 +71,7 @@ def test_the_table_of_readings_is_what_gradients_say():
     It does not use the checker's table, nor the notebook's way to shake outputs.
     """
     task = get_task("BallCircle")
-    agent = C2IQL(task, C2IQL.configure("printed", task, hidden_width=8, crm_width=8, batch_size=64))
+    agent = C2IQL(task, C2IQL.configure("printed", hidden_width=8, crm_width=8, batch_size=64))
     generator = torch.Generator().manual_seed(0)
 
     def draw(*shape):

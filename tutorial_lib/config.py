@@ -78,8 +78,6 @@ class Config:
         "printed": _LAPTOP | {"normalise_observations": False},
     }
     """The values that a profile changes in the defaults of this class. A derived class adds its own."""
-    tasks: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
-    """The values that a task changes in profile `small`, by the name of the task."""
 
     def __post_init__(self):
         for name, hint in get_type_hints(type(self), include_extras=True).items():
@@ -87,8 +85,8 @@ class Config:
                 _check(name, hint, getattr(self, name))
 
     @classmethod
-    def make(cls, profile: str = "small", task: str | None = None) -> Self:
-        """Returns the options of a profile. In profile `small`, a task's own values are among them.
+    def make(cls, profile: str = "small") -> Self:
+        """Returns the options of a profile. They are the same for every task.
 
         Raises ValueError for an unknown profile.
         """
@@ -97,8 +95,6 @@ class Config:
         changes: dict[str, Any] = {"profile": profile}
         for kind in reversed(cls.__mro__):
             changes |= vars(kind).get("profiles", {}).get(profile, {})
-        if profile == "small":
-            changes |= cls.tasks.get(task or "", {})
         return cls(**changes)
 
     def changed(self, **changes: Any) -> Self:

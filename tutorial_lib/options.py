@@ -17,7 +17,6 @@ import tyro
 
 from tutorial_lib.agents import ALGORITHMS, Agent, get_algorithm, slug
 from tutorial_lib.config import Config
-from tutorial_lib.tasks import get_task
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,15 +42,14 @@ class Training:
 def parse_training(words: Sequence[str]) -> tuple[type[Agent], Training]:
     """Returns the algorithm and the arguments of `c2iql train [ALGORITHM] TASK [options]`.
 
-    The defaults of the options depend on the algorithm, the profile and the task. Raises ValueError for an
-    unknown name, and where the task does not stand before the options.
+    The defaults of the options depend on the algorithm and the profile. Raises ValueError for an unknown
+    name.
     """
     words = list(words)
     names = {*ALGORITHMS, *map(slug, ALGORITHMS)}
     two_names = len(words) > 1 and not any(word.startswith("-") for word in words[:2])
     kind = get_algorithm(words.pop(0) if two_names or set(words[:1]) & names else "C2IQL")
-    task = get_task(words[0]) if words and not words[0].startswith("-") else None
-    default = kind.configure(_profile(words), task)
+    default = kind.configure(_profile(words))
     options = dataclasses.make_dataclass(
         "Options",
         [("config", Annotated[kind.Config, tyro.conf.OmitArgPrefixes], dataclasses.field(default=default))],
@@ -66,8 +64,6 @@ def parse_training(words: Sequence[str]) -> tuple[type[Agent], Training]:
     if {"-h", "--help"} & set(words):
         words = ["--help"]  # after a task, tyro's help does not show TASK
     args: Any = tyro.cli(options, args=words, prog=f"c2iql train {slug(kind.name)}")
-    if task is None:  # the defaults do not include the task's own options
-        raise ValueError("write the task before the options: c2iql train [ALGORITHM] TASK [options]")
     return kind, args
 
 

@@ -88,7 +88,7 @@ def make_agent(kind, runs=None, device="cpu", **changes):
     seeds, limits = zip(*(runs or runs_of(kind)), strict=True)
     names = [field.name for field in dataclasses.fields(kind.Config)]
     tiny = {name: value for name, value in TINY.items() if name in names}
-    config = kind.configure("small", TASK, **tiny | changes)
+    config = kind.configure("small", **tiny | changes)
     return kind(TASK, config, seeds, limits if kind.needs_limit else None, device)
 
 

@@ -186,13 +186,13 @@ class Agent(Runs):
         return self.row_name(self.config.profile)
 
     @classmethod
-    def configure(cls, profile: str = "small", task: Task | None = None, **changes: Any) -> AnyConfig:
-        """Returns the options of a profile, changed by those of the task, if one is given, and by `changes`.
+    def configure(cls, profile: str = "small", **changes: Any) -> AnyConfig:
+        """Returns the options of a profile, changed by `changes`.
 
         Raises ValueError for an unknown profile, an option that the algorithm does not have, or a value that
         is out of its bound.
         """
-        return cls.Config.make(profile, None if task is None else task.name).changed(**changes)
+        return cls.Config.make(profile).changed(**changes)
 
     @classmethod
     def count_parameters(

@@ -265,7 +265,7 @@ def entries(
             runs = Runs(
                 task=task,
                 algorithm=algorithm,
-                config=change(kind.configure(grid.profile or profile, record, **options)),
+                config=change(kind.configure(grid.profile or profile, **options)),
                 seeds=tuple(range(grid.first_seed, grid.first_seed + grid.seeds)),
                 trained_for=record.thresholds if kind.needs_limit else None,
                 limits=grid.limits and grid.limits(record),
