@@ -9,6 +9,7 @@ import os
 import resource
 import signal
 import sys
+import threading
 import time
 import traceback
 from collections.abc import Callable, Sequence
@@ -17,6 +18,7 @@ from typing import Any, NamedTuple
 
 import psutil
 import torch
+from tqdm import auto, std
 
 from tutorial_lib import __main__ as cli
 
@@ -93,6 +95,8 @@ def start(work: Work, folder: Path, memory: int = MEMORY) -> int:
         most = psutil.Process().memory_info().vms + memory
         resource.setrlimit(resource.RLIMIT_AS, (most, most))
         torch.set_num_threads(1)
+        for bar in (std.tqdm, auto.tqdm):  # forks share a lock, which a killed process would hold for ever
+            bar.set_lock(threading.RLock())
         work()
         status = 0
     except SystemExit as end:
