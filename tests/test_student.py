@@ -204,7 +204,7 @@ def test_a_notebook_with_no_exercise_done_runs_to_its_end(path, tmp_path):
         (tmp_path / name).symlink_to(ROOT / name)
     command = [
         sys.executable, "-m", "nbconvert", "--log-level=ERROR", "--KernelManager.transport_encryption=auto",
-        "--to", "notebook", "--execute", "--inplace", folder / path.name,
+        "--ExecutePreprocessor.timeout=300", "--to", "notebook", "--execute", "--inplace", folder / path.name,
     ]  # fmt: skip
     done = subprocess.run(command, capture_output=True, text=True, env=os.environ | {"OMP_NUM_THREADS": "1"})
     assert done.returncode == 0, done.stderr
