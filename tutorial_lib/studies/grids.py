@@ -132,10 +132,7 @@ STUDIES: dict[str, Study] = {
     ),
     "ablations": Study(
         "Figures 3 and 7: what do cost reconstruction and constraint conditioning each add?",
-        (
-            Grid(("CarCircle", "BallCircle"), ABLATIONS),
-            Grid(("DroneCircle",), ABLATIONS, ({"cost_critics": 2},)),  # the task's own option is one critic
-        ),
+        (Grid(("CarCircle", "BallCircle", "DroneCircle"), ABLATIONS),),
     ),
     "kappas": Study(
         "Figure 4: what do the two expectiles do?",
